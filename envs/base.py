@@ -1,0 +1,132 @@
+"""What all worlds share: the `World` description, the checks of their options and the compiled batch loop.
+
+A world is a small state (a row of integers), a compiled function `step` that changes it by one joint action, and a compiled
+function `observe` that says what each agent sees of it. Everything else (vector face, search, drawing) is built on these two.
+"""
+
+from functools import cache
+
+import numpy as np
+from numba import njit
+
+
+class UsageError(ValueError):
+    """Something that was asked for is impossible; the message is one sentence that says what would be accepted."""
+
+
+class World:
+    """A gridworld: its rules and the numbers that describe it. One subclass per world, one instance per choice of options.
+
+    `step(rules, state, actions) -> (reward, outcome)` changes `state` [state_dim] (int64) by the joint action [num_agents]
+    and returns the team's reward and the outcome (0: still running, k: ended as `outcome_names[k - 1]`).
+    `observe(rules, cell, state, obs)` writes what the agents see into `obs` [num_agents, obs_dim] (float32).
+    Both are compiled by numba and take `rules` as the world built it: an array or a record of the world's numbers.
+    """
+
+    name: str
+    action_names: tuple[str, ...]
+    outcome_names: tuple[str, ...]  # the names of outcomes 1, 2, ...
+    best_outcome: int  # the outcome a good team ends in; 0 if the world has none
+    searchable = True  # small enough for `envs.optimum` to visit every state
+    step = observe = None  # compiled functions, set by the subclass as staticmethod
+
+    def __init__(self, rules, start, local_index, num_agents, obs_dim, cell, state_scale, max_steps):
+        """Arguments:
+        rules:       what `step` and `observe` take as their first argument
+        start:       initial state, integers [state_dim]
+        local_index: which entries of the state belong to each agent (its position, facing, the box), [num_agents, d]
+        num_agents:  number of agents
+        obs_dim:     length of one agent's observation
+        cell:        width of one cell in units of the observation (1 / size for scaled positions, 1 for one-hot)
+        state_scale: factors that bring the entries of the state into about [0, 1], [state_dim]
+        max_steps:   an episode is cut (truncated) after this many steps
+        """
+        self.max_steps = check_whole("max_steps", max_steps, minimum=1)
+        self.rules, self.start = rules, np.array(start, np.int64)
+        self.local_index = np.array(local_index, np.int64)
+        self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, cell
+        self.state_scale = np.array(state_scale, np.float32)
+
+    @property
+    def num_actions(self) -> int:
+        return len(self.action_names)
+
+    def sketch(self, state):
+        """The picture of `state` as `(height, width, shapes)`, see `envs.drawing`."""
+        raise NotImplementedError
+
+
+def check_whole(option, value, minimum):
+    """`value` if it is a whole number of at least `minimum`; UsageError otherwise."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise UsageError(f"{option} must be a whole number of at least {minimum}, not {value!r}.")
+    return int(value)
+
+
+def check_number(option, value, lowest, highest=np.inf):
+    """`value` as a float if it is a finite number between `lowest` and `highest`; UsageError otherwise."""
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and np.isfinite(value) and lowest <= value <= highest):
+        bounds = f"of at least {lowest}" if highest == np.inf else f"between {lowest} and {highest}"
+        raise UsageError(f"{option} must be a number {bounds}, not {value!r}.")
+    return float(value)
+
+
+def check_choice(option, value, choices):
+    """`value` if it is one of `choices`; UsageError otherwise."""
+    if value not in choices or type(value) is not type(choices[0]):
+        raise UsageError(f"{option} must be one of {', '.join(map(repr, choices))}, not {value!r}.")
+    return value
+
+
+@njit(cache=True)
+def observe_positions(rules, cell, state, obs):
+    """Every agent sees the first obs_dim entries of the state: the positions of all agents (and the box), in map widths."""
+    for i in range(obs.shape[0]):
+        for j in range(obs.shape[1]):
+            obs[i, j] = state[j] * cell
+
+
+@njit(cache=True)
+def observe_own(rules, cell, state, obs):
+    """Every agent sees only its own row and column, in map widths."""
+    for i in range(obs.shape[0]):
+        obs[i, 0] = state[2 * i] * cell
+        obs[i, 1] = state[2 * i + 1] * cell
+
+
+@cache
+def compile_batch(step, observe):
+    """The compiled functions `advance` and `look` for a whole batch of worlds with these rules.
+
+    They enclose `step` and `observe` and are compiled anew in every process (about half a second): numba's cache on disk would
+    save them together with the rules that they were first compiled for, and an edited world would silently keep its old rules.
+    """
+
+    @njit
+    def look(rules, cell, local_index, state_scale, state, obs, global_state, local_state):
+        """Write what is to be seen of the worlds' states: observations, global states, and the agents' own entries."""
+        for e in range(len(state)):
+            observe(rules, cell, state[e], obs[e])
+            for j in range(state.shape[1]):
+                global_state[e, j] = state[e, j] * state_scale[j]
+            for i in range(local_index.shape[0]):
+                for j in range(local_index.shape[1]):
+                    local_state[e, i, j] = state[e, local_index[i, j]]
+
+    @njit
+    def advance(rules, num_actions, max_steps, state, clock, outcome, actions, reward, flags):
+        """One time step of every world that still runs. An ended one stays still at reward 0 and keeps flags and outcome."""
+        for e in range(len(state)):
+            for i in range(actions.shape[1]):
+                if not 0 <= actions[e, i] < num_actions:
+                    raise ValueError("an action is none of the world's actions 0, 1, ...")
+        for e in range(len(state)):
+            reward[e] = 0.0
+            if outcome[e] == 0 and clock[e] < max_steps:
+                reward[e], outcome[e] = step(rules, state[e], actions[e])
+                clock[e] += 1
+            flags[0, e] = outcome[e] > 0  # terminated: the world itself has ended
+            flags[1, e] = outcome[e] == 0 and clock[e] >= max_steps  # truncated: cut by the time limit
+
+    return advance, look

@@ -1,0 +1,161 @@
+"""The exact optimum of a world, found in its compiled rules: every state it can reach, then dynamic programming over time.
+
+Nothing here knows a world's numbers; what is found is what `world.step` says. The value of a state at time t is the largest
+return with which it can be reached in exactly t steps; the steps that end the episode give the best by outcome and length.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from envs.base import UsageError, World
+from envs.statistics import reward_per_step
+
+MAX_STATES = 3_000_000
+ROUNDING = 1e-9  # returns that differ by less are the same sum, added up in another order
+
+
+class Episode(NamedTuple):
+    """What matters of one episode."""
+
+    outcome: str  # how it ended: one of the world's outcome names, or "time limit"
+    steps: int  # T, its number of steps
+    total: float  # its undiscounted return
+    per_step: float  # its reward per step: total / max(T - 1, 1)
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The best that any team can do in a world.
+
+    fewest:        for every outcome that max_steps leave time for, by name, the best of its shortest episodes
+    best_return:   the episode with the largest undiscounted return, the shortest if there are several
+    best_per_step: the episode with the largest reward per step, the shortest if there are several
+    num_states:    number of states that play can reach (states in which the episode has ended not counted)
+    """
+
+    fewest: dict[str, Episode]
+    best_return: Episode
+    best_per_step: Episode
+    num_states: int
+
+    def __str__(self):
+        episodes = [("fewest steps", episode) for episode in self.fewest.values()]
+        episodes += [("best return", self.best_return), ("best per step", self.best_per_step)]
+        lines = [f"{'':15}{'outcome':15}{'steps':>5}{'return':>10}{'reward per step':>18}"]
+        lines += [f"{what:15}{e.outcome:15}{e.steps:5}{e.total:10.4g}{e.per_step:18.4f}" for what, e in episodes]
+        return "\n".join([*lines, f"{self.num_states} states"])
+
+
+def find_optimum(world: World) -> Optimum:
+    """The optimum of `world` within its max_steps; UsageError if it has more than MAX_STATES states.
+
+    Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions.
+    """
+    joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
+    following, reward = compile_explore(world.step)(world.rules, world.start, joint, MAX_STATES)
+    if len(following) > MAX_STATES:
+        raise UsageError(f"only worlds of at most {MAX_STATES} states can be searched, and this {world.name} has more.")
+
+    returns = best_returns(following, reward, len(world.outcome_names), world.max_steps)
+    per_step = reward_per_step(returns, np.arange(world.max_steps + 1)[:, None])
+    names = ("time limit", *world.outcome_names)
+
+    def episode(t, k):
+        return Episode(names[k], int(t), float(returns[t, k]), float(per_step[t, k]))
+
+    def largest(table):
+        return episode(*np.argwhere(table >= table.max() - ROUNDING)[0])  # rows are lengths: the first is the shortest
+
+    possible = returns > -np.inf
+    fewest = {names[k]: episode(possible[:, k].argmax(), k) for k in range(1, len(names)) if possible[:, k].any()}
+    return Optimum(fewest, largest(returns), largest(per_step), len(following))
+
+
+@njit(cache=True)
+def slot_of(table, states, state):
+    """The slot of the hash table `table` (open addressing) that holds the number of `state`, or -1 and is where it belongs."""
+    code = np.uint64(14695981039346656037)
+    for entry in state:
+        code = (code ^ np.uint64(entry)) * np.uint64(1099511628211)  # FNV-1a
+    mask = np.uint64(len(table) - 1)
+    slot = (code ^ (code >> np.uint64(32))) & mask
+    while table[slot] >= 0 and np.any(states[table[slot]] != state):
+        slot = (slot + np.uint64(1)) & mask
+    return slot
+
+
+@cache
+def compile_explore(step):
+    """The compiled enumeration of the states; it encloses `step` and is not cached, for the reason given in `compile_batch`."""
+
+    @njit
+    def explore(rules, start, joint, limit):
+        """All states that the joint actions `joint` [J, num_agents] can reach from `start` [state_dim], breadth first.
+
+        Returns following [S, J], the number of the next state or -k where the episode ends with outcome k, and reward [S, J].
+        The start is state 0. More than `limit` states: it gives up, and S > limit.
+        """
+        room = limit + len(joint)  # the system hands out only the memory that is written to
+        states = np.empty((room, len(start)), np.int16)
+        following = np.empty((room, len(joint)), np.int32)
+        reward = np.empty((room, len(joint)))
+        table = np.full(1 << 23, -1, np.int32)  # at most 3 / 8 full
+        state = start.copy()
+        states[0] = state
+        table[slot_of(table, states, state)] = 0
+        count, s = 1, 0
+        while s < count <= limit:
+            for j in range(len(joint)):
+                state[:] = states[s]
+                reward[s, j], outcome = step(rules, state, joint[j])
+                if outcome > 0:
+                    following[s, j] = -outcome
+                    continue
+                slot = slot_of(table, states, state)
+                if table[slot] < 0:
+                    states[count] = state
+                    table[slot] = count
+                    count += 1
+                following[s, j] = table[slot]
+            s += 1
+        return following[:count], reward[:count]
+
+    return explore
+
+
+@njit(cache=True)
+def best_returns(following, reward, num_outcomes, max_steps):
+    """The largest return of an episode by its length t and outcome k, [max_steps + 1, num_outcomes + 1]; -inf if there is none.
+
+    following, reward: what `explore` returns. Outcome 0 is the episode cut by the time limit, so only t = max_steps has it.
+    """
+    returns = np.full((max_steps + 1, num_outcomes + 1), -np.inf)
+    value = np.full(len(following), -np.inf)  # largest return with which a state is reached in exactly t steps
+    value[0] = 0.0
+    for t in range(1, max_steps + 1):
+        later = np.full(len(following), -np.inf)
+        for s in range(len(following)):
+            if value[s] == -np.inf:
+                continue
+            for j in range(following.shape[1]):
+                total, target = value[s] + reward[s, j], following[s, j]
+                if target >= 0:
+                    later[target] = max(later[target], total)
+                else:
+                    returns[t, -target] = max(returns[t, -target], total)
+        gain = later[0] - value[0]
+        predicted = value + gain
+        value = later
+        if np.isfinite(gain) and np.all((later == predicted) | (np.abs(later - predicted) < 1e-9)):
+            # This step added the same gain to every state's value, so every later step will: the rest is known.
+            for rest in range(t + 1, max_steps + 1):
+                returns[rest] = returns[rest - 1] + gain
+            value = value + gain * (max_steps - t)
+            break
+    returns[max_steps, 0] = value.max()
+    return returns
