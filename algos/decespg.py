@@ -1,0 +1,655 @@
+"""DecESPG: REINFORCE with private exploration bonuses and a selective memory (Algorithm 1 of the paper), on the base of pg.py.
+
+1. Every agent remembers its last m pairs u = (o, a). A Gaussian process says how much a new pair has been visited, eta(u) in (0, 1]
+   (Eqs. 5-7), and the agent's reward becomes r' = r + beta EB(u) with EB(u) = -log eta(u) (Eqs. 8-9).
+2. For every terminal state the team keeps its best episodes, and the gradient of Eq. 14 gets their gradients on top (Eqs. 15-16).
+
+Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021).
+
+    python algos/decespg.py --env pushbox --seed 3
+"""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from numba import njit
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import envs
+
+# Table 1 of the paper.
+WORLDS = {
+    "findtreasure": dict(hidden=(64,), gamma=0.98, max_steps=200, num_episodes=10_000),
+    "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
+}
+# The tuning rule's choice for each world and optimiser (benchmark/tuning/decespg.md).
+TUNED = {
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3),
+    ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, beta=10.0),
+}
+# The lowest and highest value of every number that makes sense.
+LIMITS = dict(
+    **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
+    **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
+    **dict(beta=(0, np.inf), window=(1, np.inf), sigma=(1e-3, np.inf), noise=(1e-6, np.inf), slots=(0, np.inf)),
+)
+
+
+@dataclass
+class Args:
+    env: str = "pushbox"
+    """world: findtreasure or pushbox"""
+    env_args: tuple[str, ...] = ()
+    """options of the world, such as size=6 (envs/<world>.py lists them)"""
+    seed: int = 1
+    """seed of the first trial; trial k has seed + k"""
+    num_trials: int = 1
+    """independent trials, trained side by side in this process"""
+    num_episodes: int | None = None
+    """training episodes of each trial (default: Table 1); with --evaluate, episodes to play (default: 100)"""
+    max_steps: int | None = None
+    """time limit of an episode in steps (default: Table 1)"""
+    hidden: tuple[int, ...] | None = None
+    """widths of the hidden layers (default: Table 1)"""
+    gamma: float | None = None
+    """discount factor (default: Table 1)"""
+    optimizer: Literal["sign", "adam"] = "sign"
+    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    learning_rate: float | None = None
+    """step size of the policies (default: tuned for world and optimiser)"""
+    log_every: int = 100
+    """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
+    run_dir: Path | None = None
+    """where the run's files go (default: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
+    checkpoint_every: float = 60.0
+    """seconds between two checkpoints (longer where writing one would take over 2 %% of the time)"""
+    resume: bool = False
+    """go on from the checkpoint in the run's directory"""
+    overwrite: bool = False
+    """start anew even if the run's directory holds results"""
+    save_model: bool = False
+    """write the trained policies to policy.pt"""
+    capture_video: bool = False
+    """write one episode of the first trial's trained team to team.gif"""
+    evaluate: Path | None = None
+    """do not train: play the teams of this policy.pt, print how their episodes end and write a GIF beside it"""
+    greedy: bool = False
+    """with --evaluate: take the likeliest actions instead of drawing from the policies"""
+    beta: float | None = None
+    """weight of the exploration bonus, in units of reward (beta of Eq. 9; default: tuned for world and optimiser)"""
+    window: int = 50
+    """visits that each agent remembers (m of Section 3.1.4)"""
+    sigma: float = 0.5
+    """width of the kernel (sigma of Eq. 5) in cells where agents observe positions, in units of the observation where it is one-hot"""
+    noise: float = 0.01
+    """variance of the noise in a visit (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
+    slots: int = 10
+    """episodes that the memory keeps for each terminal state; 0 switches it off"""
+
+
+class StackedMLP:
+    """Independent multilayer perceptrons with ReLU side by side, applied with one batched product per layer."""
+
+    def __init__(self, generators, nets_per_trial, sizes):
+        """Weights [num_nets, in, out], biases [num_nets, 1, out], all ~ U(-1/sqrt(in), 1/sqrt(in)); one generator a trial."""
+        self.params = []
+        for width, next_width in pairwise(sizes):
+            for rows in (width, 1):
+                shape, bound = (nets_per_trial, rows, next_width), width**-0.5
+                draws = np.concatenate([generator.uniform(-bound, bound, shape) for generator in generators])
+                self.params.append(torch.from_numpy(draws).float().requires_grad_())
+
+    def __call__(self, x):
+        """x [num_nets, batch, in] -> [num_nets, batch, out]."""
+        for layer in range(0, len(self.params), 2):
+            if layer > 0:
+                x = torch.relu(x)
+            x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
+        return x
+
+
+class StackedOptimizer:
+    """Gradient descent for stacked networks, every network on its own.
+
+    "sign": w -= lr g / (|g| + 1e-8), which is exactly the first step of a fresh Adam (the authors create one in every update).
+    "adam": Adam (Kingma & Ba, 2015) with betas 0.9 and 0.999; moments and step count belong to the network.
+    """
+
+    def __init__(self, params, kind, learning_rate):
+        self.params, self.kind, self.learning_rate = params, kind, learning_rate
+        self.count = torch.zeros(len(params[0]), 1, 1)
+        self.moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params if kind == "adam"]
+        self.state = [self.count, *(m.requires_grad_(False) for pair in self.moments for m in pair)]
+
+    @torch.no_grad()
+    def step(self, grads, active=None):
+        """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
+        mask = torch.ones_like(self.count) if active is None else active.view(-1, 1, 1).float()
+        if self.kind == "sign":
+            for param, grad in zip(self.params, grads, strict=True):
+                param.addcdiv_(grad * mask, grad.abs().add_(1e-8), value=-self.learning_rate)
+            return
+        self.count += mask
+        correction1, correction2 = 1 - 0.9 ** self.count.clamp(min=1), 1 - 0.999 ** self.count.clamp(min=1)
+        for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
+            first += (0.1 * mask) * (grad - first)
+            second += (0.001 * mask) * (grad * grad - second)
+            param.addcdiv_(first * (mask / correction1), (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
+
+
+@njit(cache=True)
+def sample_actions(logits, uniforms):
+    """Draw from softmax(logits) by inverting the distribution function.
+
+    logits [num_trials, num_agents, num_actions], uniforms in [0, 1) [num_trials, num_agents] -> actions, shaped as uniforms.
+    """
+    actions = np.empty(uniforms.shape, np.int64)
+    for k in range(logits.shape[0]):
+        for i in range(logits.shape[1]):
+            highest = logits[k, i].max()
+            total = 0.0
+            for logit in logits[k, i]:
+                total += np.exp(np.float64(logit - highest))
+            a, remaining = -1, uniforms[k, i] * total
+            while remaining >= 0.0 and a < logits.shape[2] - 1:
+                a += 1
+                remaining -= np.exp(np.float64(logits[k, i, a] - highest))
+            actions[k, i] = a
+    return actions
+
+
+class Rollout:
+    """One episode of every trial, time first; a row beyond a trial's length counts for nothing."""
+
+    def __init__(self, env):
+        world, shape = env.world, (env.world.max_steps, env.num_envs)
+        self.obs = np.zeros((*shape, world.num_agents, world.obs_dim), np.float32)
+        self.actions = np.zeros((*shape, world.num_agents), np.int64)
+        self.reward = np.zeros(shape)
+        self.lengths = np.zeros(env.num_envs, np.int64)
+        self.outcomes = np.zeros(env.num_envs, np.int64)
+
+
+@torch.no_grad()
+def collect(env, policy, uniforms, rollout, frames=None):
+    """Play one episode in every world, in lock step until the last has ended, and write it into `rollout`.
+
+    The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
+    Pictures of the first world are appended to `frames` if it is a list.
+    """
+    teams = (env.num_envs, env.world.num_agents)
+    obs, _ = env.reset()
+    rollout.lengths[:] = 0
+    running = np.ones(env.num_envs, bool)
+    for t in range(env.world.max_steps):
+        logits = policy(torch.from_numpy(obs).view(teams[0] * teams[1], 1, -1)).view(*teams, -1).numpy()
+        actions = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[:, t])
+        rollout.obs[t], rollout.actions[t] = obs, actions
+        rollout.lengths += running
+        obs, rollout.reward[t], terminated, truncated, info = env.step(actions)
+        if frames is not None and running[0]:
+            frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
+        running = ~(terminated | truncated)
+        if not running.any():
+            break
+    rollout.outcomes[:] = info["outcome"]
+
+
+@njit(cache=True)
+def discounted_returns(reward, lengths, gamma):
+    """G_t = r_t + gamma G_{t+1} of every step; reward [T, num_trials, num_agents], lengths [num_trials] -> shaped as reward."""
+    returns = np.zeros(reward.shape)
+    for k in range(reward.shape[1]):
+        for i in range(reward.shape[2]):
+            tail = 0.0
+            for t in range(lengths[k] - 1, -1, -1):
+                tail = reward[t, k, i] + gamma * tail
+                returns[t, k, i] = tail
+    return returns
+
+
+@njit(cache=True)
+def merge_steps(obs, actions, weights, lengths, num_actions):
+    """Add up the weights of equal steps: sum_t w_t log pi(a_t | o_t) needs every distinct observation only once.
+
+    obs [T, num_trials, num_agents, obs_dim], actions and weights [T, num_trials, num_agents], lengths [num_trials]
+    -> distinct observations [num_nets, U, obs_dim] and the weights of all actions there [num_nets, U, num_actions], 0 in the
+    rows that a network with fewer than U distinct observations leaves over. There is one network per trial and agent.
+    """
+    _, trials, agents, dim = obs.shape
+    distinct = np.zeros((trials * agents, lengths.max(), dim), np.float32)
+    weight = np.zeros((trials * agents, lengths.max(), num_actions))
+    buckets = 2
+    while buckets < 2 * lengths.max():
+        buckets *= 2
+    bits = obs.view(np.int32)
+    most = 0
+    for k in range(trials):
+        for i in range(agents):
+            net, found = k * agents + i, 0
+            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
+            for t in range(lengths[k]):
+                bucket = 0
+                for j in range(dim):
+                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
+                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
+                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
+                    bucket = (bucket + 1) & (buckets - 1)
+                if row_in[bucket] < 0:
+                    row_in[bucket] = found
+                    distinct[net, found] = obs[t, k, i]
+                    found += 1
+                weight[net, row_in[bucket], actions[t, k, i]] += weights[t, k, i]
+            most = max(most, found)
+    return distinct[:, :most].copy(), weight[:, :most].astype(np.float32)
+
+
+@njit(cache=True)
+def visit_counts(obs, actions, lengths, past_obs, past_actions, inverse, visits, sigma, noise):
+    """Go through an episode: the bounded visit count eta of each step, then remember the step; all agents by themselves.
+
+    obs [T, num_trials, num_agents, obs_dim], actions [T, num_trials, num_agents], lengths [num_trials] -> eta [T, num_trials, num_agents].
+    What is remembered stands in rings, visit number n at n mod m: past_obs [num_trials, num_agents, obs_dim, m],
+    past_actions [num_trials, num_agents, m], inverse = (K + noise I)^-1 [num_trials, num_agents, m, m] (0 where nothing is yet) and the number
+    of visits so far [num_trials]. As the rows of a ring are in no order, Eqs. 12-13 here replace row `slot`, not the first one.
+    """
+    _, trials, agents, dim = obs.shape
+    m = past_actions.shape[2]
+    eta = np.ones(actions.shape)
+    kernel, product, column = np.empty(m), np.empty(m), np.empty(m)
+    for k in range(trials):
+        for i in range(agents):
+            inv, seen_obs, seen_actions = inverse[k, i], past_obs[k, i], past_actions[k, i]
+            for t in range(lengths[k]):
+                visit = visits[k] + t
+                slot, full = visit % m, visit >= m
+
+                # Eq. 5 with C = 1, for u = (o, one-hot a): two different actions are a squared distance of 2 apart.
+                for j in range(m):
+                    kernel[j] = 2.0 * (seen_actions[j] != actions[t, k, i])
+                for d in range(dim):
+                    for j in range(m):
+                        kernel[j] += (obs[t, k, i, d] - seen_obs[d, j]) ** 2
+                for j in range(m):
+                    exponent = kernel[j] / (2.0 * sigma * sigma)
+                    kernel[j] = np.exp(-exponent) if exponent < 40.0 and j < visit else 0.0  # exp(-40) is 0 beside 1
+
+                # Eq. 7 with targets 1, because every remembered pair was visited: eta = k^T inv 1.
+                product[:] = 0.0
+                for j in range(m):
+                    if kernel[j] > 0.0:
+                        for l in range(m):
+                            product[l] += inv[j, l] * kernel[j]
+                eta[t, k, i] = product.sum()
+
+                # Forget the visit in `slot` (B of Eq. 13, from Eq. 12; before the ring is full there is none) and append the new
+                # one (Eq. 11, and again Eq. 13): product becomes B h, and the inverse B + s (B h)(B h)^T, bordered by -s B h and s.
+                column[:] = inv[slot]
+                forget = 1.0 / column[slot] if full else 0.0
+                for l in range(m):
+                    product[l] -= kernel[slot] * column[l]
+                kernel[slot] = 0.0
+                projection = product[slot] * forget
+                gain = 1.0 + noise
+                for l in range(m):
+                    product[l] -= projection * column[l]
+                    gain -= kernel[l] * product[l]
+                s = 1.0 / gain
+                for j in range(m):
+                    left, right = s * product[j], forget * column[j]
+                    if left != 0.0 or right != 0.0:
+                        for l in range(m):
+                            inv[j, l] += left * product[l] - right * column[l]
+                for l in range(m):
+                    inv[slot, l] = inv[l, slot] = -s * product[l]
+                inv[slot, slot] = s
+                seen_actions[slot] = actions[t, k, i]
+                for d in range(dim):
+                    seen_obs[d, slot] = obs[t, k, i, d]
+    for k in range(trials):
+        visits[k] += lengths[k]
+    return eta
+
+
+class VisitNovelty:
+    """The exploration bonus of Section 3.1: every agent's private window of visits and the Gaussian process over it."""
+
+    def __init__(self, num_trials, num_agents, obs_dim, window, sigma, noise):
+        self.obs = np.zeros((num_trials, num_agents, obs_dim, window))
+        self.actions = np.zeros((num_trials, num_agents, window), np.int64)
+        self.inverse = np.zeros((num_trials, num_agents, window, window))
+        self.visits = np.zeros(num_trials, np.int64)
+        self.sigma, self.noise = sigma, noise
+        self.state = [self.obs, self.actions, self.inverse, self.visits]
+
+    def bonus(self, obs, actions, lengths):
+        """EB = -log eta of every step of an episode (Eq. 8), [T, num_trials, num_agents], and the shares of steps at both clamps.
+
+        eta lies in (0, 1] in the paper; here it is clamped to [1e-3, 1], because pairs unlike any remembered one have eta = 0 and
+        pairs between several remembered ones may have eta > 1.
+        """
+        eta = visit_counts(obs, actions, lengths, *self.state, self.sigma, self.noise)
+        steps = lengths * eta.shape[2]
+        return -np.log(eta.clip(1e-3, 1)), (eta < 1e-3).sum((0, 2)) / steps, (eta > 1).sum((0, 2)) / steps
+
+
+class SelectiveMemory:
+    """The best episodes of each terminal state (Section 3.2), kept jointly for the team, and their gradient."""
+
+    def __init__(self, env, slots):
+        world = env.world
+        shape = (env.num_envs, len(world.outcome_names) + 1, slots)  # outcome 0, the time limit, is a terminal state too
+        self.value = np.full(shape, -np.inf)  # Psi*, the discounted return of the original reward
+        self.lengths = np.zeros(shape, np.int64)
+        self.obs = np.zeros((*shape, world.max_steps, world.num_agents, world.obs_dim), np.float32)
+        self.actions = np.zeros((*shape, world.max_steps, world.num_agents), np.int64)
+        self.returns = np.zeros((*shape, world.max_steps))
+        self.num_actions = world.num_actions
+        self.state = [self.value, self.lengths, self.obs, self.actions, self.returns]
+        self.replays = [None] * env.num_envs
+
+    def remember(self, rollout, returns):
+        """Keep each trial's episode if it is better than the worst one kept for its terminal state; returns [T, num_trials] without bonus."""
+        for k, (outcome, length) in enumerate(zip(rollout.outcomes, rollout.lengths, strict=True)):
+            values = self.value[k, outcome]
+            if values.size and returns[0, k] > values.min():
+                slot = k, outcome, values.argmin()
+                self.value[slot], self.lengths[slot] = returns[0, k], length
+                self.obs[slot][:length], self.actions[slot][:length] = rollout.obs[:length, k], rollout.actions[:length, k]
+                self.returns[slot][:length] = returns[:length, k]
+                self.replays[k] = None
+
+    def replay(self):
+        """The steps of the second term of Eq. 16, merged as by `merge_steps`: sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j.
+
+        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. The stored returns
+        stay as they are, so the steps are merged again only when the memory has changed.
+        """
+        changed = [k for k, replay in enumerate(self.replays) if replay is None]
+        for k in changed:
+            self.replays[k] = self._merge(k)
+        if changed:
+            rows = max(obs.shape[1] for obs, _ in self.replays)
+            agents, dim = self.obs.shape[-2:]
+            self.stacked = [np.zeros((len(self.replays) * agents, rows, width), np.float32) for width in (dim, self.num_actions)]
+            for k, replay in enumerate(self.replays):
+                for stacked, part in zip(self.stacked, replay, strict=True):
+                    stacked[k * agents : (k + 1) * agents, : part.shape[1]] = part
+        return self.stacked
+
+    def _merge(self, k):
+        chosen = np.argwhere(self.value[k] > 0)
+        total = self.value[k][self.value[k] > 0].sum()
+        obs, actions, weights = [], [], []
+        for outcome, slot in chosen:
+            length = self.lengths[k, outcome, slot]
+            obs.append(self.obs[k, outcome, slot, :length])
+            actions.append(self.actions[k, outcome, slot, :length])
+            weights.append(self.value[k, outcome, slot] / total / length * self.returns[k, outcome, slot, :length])
+        agents, dim = self.obs.shape[-2:]
+        obs = np.concatenate([np.zeros((0, agents, dim), np.float32), *obs])
+        actions = np.concatenate([np.zeros((0, agents), np.int64), *actions])
+        weights = np.repeat(np.concatenate([np.zeros(0), *weights])[:, None], agents, axis=1)
+        return merge_steps(obs[:, None], actions[:, None], weights[:, None], np.array([len(obs)]), self.num_actions)
+
+
+def train(args: Args):
+    """Train `num_trials` teams side by side; returns the policies, the method's parts and the log of all episodes."""
+    torch.set_num_threads(1)
+    args, env = resolve(args)
+    world, num_agents = env.world, env.world.num_agents
+    seeds = [np.random.SeedSequence(args.seed + k).spawn(3) for k in range(args.num_trials)]
+    init, act, _ = [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
+
+    policy = StackedMLP(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
+    optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
+    novelty = VisitNovelty(args.num_trials, num_agents, world.obs_dim, args.window, args.sigma * world.cell, args.noise)
+    memory = SelectiveMemory(env, args.slots)
+    rollout = Rollout(env)
+    uniforms = np.empty((args.num_trials, world.max_steps, num_agents))
+    arrays = [*policy.params, *optimizer.state, *novelty.state, *memory.state]
+    run = Run(args, env, arrays, generators=act, figures=("bonus", "unvisited", "overvisited"))
+
+    for episode in run.episodes():
+        # Play one episode of every trial.
+        for generator, row in zip(act, uniforms, strict=True):
+            generator.random(out=row)
+        collect(env, policy, uniforms, rollout)
+        lengths, longest = rollout.lengths, rollout.lengths.max()
+        reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
+
+        # Augment each agent's reward with its own exploration bonus, Eq. 9, and remember the visits.
+        bonus, unvisited, overvisited = novelty.bonus(rollout.obs[:longest], rollout.actions[:longest], lengths)
+        augmented = reward + args.beta * bonus
+
+        # Update the selective memory, by the original reward.
+        memory.remember(rollout, discounted_returns(reward, lengths, args.gamma)[:, :, 0])
+
+        # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14, and the memory's gradient, Eq. 16.
+        returns = discounted_returns(augmented, lengths, args.gamma)
+        obs, weight = merge_steps(rollout.obs, rollout.actions, returns / lengths[:, None], lengths, world.num_actions)
+        obs, weight = (np.concatenate(parts, axis=1) for parts in zip((obs, weight), memory.replay(), strict=True))
+        log_probs = torch.log_softmax(policy(torch.from_numpy(obs)), dim=-1)
+        loss = -(torch.from_numpy(weight) * log_probs).sum()
+        optimizer.step(torch.autograd.grad(loss, policy.params))
+
+        mean_bonus = bonus.sum((0, 2)) / (lengths * num_agents)
+        run.record(episode, rollout, bonus=mean_bonus, unvisited=unvisited, overvisited=overvisited)
+    run.finish(policy)
+    return SimpleNamespace(policy=policy, novelty=novelty, memory=memory, log=run.log)
+
+
+# --- run keeping ---
+# Arguments, directories, curves, checkpoints and evaluation: the same text in every script, and nothing that a method needs.
+
+METHOD = Path(__file__).stem
+HOUSEKEEPING = ("run_dir", "checkpoint_every", "resume", "overwrite", "save_model", "capture_video", "evaluate", "greedy")
+
+
+def resolve(args):
+    """The arguments with every None filled in from WORLDS and TUNED, and the worlds; UsageError for what is impossible."""
+    defaults = {**WORLDS.get(args.env, {}), **TUNED.get((args.env, args.optimizer), {}), "run_dir": default_run_dir(args)}
+    values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
+    options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
+    envs.make_world(args.env, **options)
+    for name, (lowest, highest) in LIMITS.items():
+        for value in values[name] if isinstance(values[name], tuple) else [values[name]]:
+            envs.check_number(f"--{name.replace('_', '-')}", value, lowest, highest)
+    return type(args)(**values), envs.make_vec(args.env, args.num_trials, **options)
+
+
+def default_run_dir(args):
+    """runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>]"""
+    words = [f"seed{args.seed}" + f"-{args.seed + args.num_trials - 1}" * (args.num_trials > 1)]
+    for field in fields(args):
+        value = getattr(args, field.name)
+        if value != field.default and field.name not in ("env", "seed", "num_trials", *HOUSEKEEPING):
+            words.append(f"{field.name}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
+    return Path("runs", args.env, METHOD, "-".join(words).replace("/", "_"))
+
+
+class Run:
+    """The directory of a run: curves, checkpoints, results.
+
+    arrays:     all arrays and tensors that training changes (of fixed shape; a checkpoint keeps them in this order)
+    generators: all random generators that training uses
+    figures:    names of the method's own curves, for which `record` takes values [num_trials]
+    """
+
+    def __init__(self, args, env, arrays, generators, figures=()):
+        self.args, self.env, self.generators = args, env, generators
+        self.log = envs.EpisodeLog(env.world, args.num_trials, args.num_episodes)
+        self.sums = {name: np.zeros(args.num_trials) for name in figures}  # since the last point of the curves
+        arrays = [*arrays, self.log.returns, self.log.lengths, self.log.outcomes, *self.sums.values()]
+        self.arrays = [torch.from_numpy(a) if isinstance(a, np.ndarray) else a.detach() for a in arrays]
+        self.settings = {name: value for name, value in asdict(args).items() if name not in HOUSEKEEPING}
+        self.checkpoint, self.result = args.run_dir / "checkpoint.pt", args.run_dir / "episodes.npz"
+        self.start = 0
+        if args.resume:
+            self._load_checkpoint()
+        elif not args.overwrite and (self.result.exists() or self.checkpoint.exists()):
+            state, advice = ("a finished", "") if self.result.exists() else ("an unfinished", "go on with --resume or ")
+            raise envs.UsageError(f"{args.run_dir} holds {state} run; {advice}start anew with --overwrite.")
+        self._open_directory()
+        trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
+        self.writers = [SummaryWriter(str(trial), purge_step=self.start, max_queue=1000) for trial in trials]
+
+    def _open_directory(self):
+        directory, leftovers = self.args.run_dir, ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif", "seed*/events.*")
+        about = {"method": METHOD, "args": asdict(self.args), "python": sys.version.split()[0]}
+        about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
+        git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
+        with contextlib.suppress(OSError):
+            about["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            for old in [] if self.args.resume else [file for name in leftovers for file in directory.glob(name)]:
+                old.unlink()
+            with envs.complete_file(directory / "args.json") as file:
+                file.write(json.dumps(about, indent=2, default=str).encode())
+        except OSError as error:
+            raise envs.UsageError(f"cannot write to {directory}: {error.strerror}.") from error
+
+    def _load_checkpoint(self):
+        if not self.checkpoint.exists():
+            raise envs.UsageError(f"there is nothing to resume: {self.args.run_dir} holds no checkpoint of an unfinished run.")
+        saved = torch.load(self.checkpoint, weights_only=True)
+        for name, value in self.settings.items():
+            if (kept := saved["settings"].get(name)) != value:
+                raise envs.UsageError(f"--resume needs the same arguments, but {name} was {kept} and is now {value}.")
+        self.start = saved["episode"]
+        for array, kept in zip(self.arrays, saved["arrays"], strict=True):
+            array.copy_(kept)
+        for generator, state in zip(self.generators, saved["generators"], strict=True):
+            generator.bit_generator.state = state
+
+    def _save_checkpoint(self, episode):
+        for writer in self.writers:
+            writer.flush()
+        states = [generator.bit_generator.state for generator in self.generators]
+        with envs.complete_file(self.checkpoint) as file:
+            torch.save({"settings": self.settings, "episode": episode, "arrays": self.arrays, "generators": states}, file)
+
+    def episodes(self):
+        """Yield the number of every episode to play; between two of them write checkpoints and listen to Ctrl-C."""
+        first, last, stopped = self.start, self.args.num_episodes, []
+        handlers = {s: signal.signal(s, lambda number, _: stopped.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+        self.bar = tqdm(initial=first, total=last, desc=f"{METHOD} {self.args.env}", unit="ep", mininterval=0.5)
+        self.clock = saved = time.monotonic()
+        pause = self.args.checkpoint_every
+        try:
+            for episode in range(first, last):
+                yield episode
+                self.bar.update()
+                if stopped or time.monotonic() - saved >= pause:
+                    began = time.monotonic()
+                    self._save_checkpoint(episode + 1)
+                    saved = time.monotonic()
+                    pause = max(self.args.checkpoint_every, 50 * (saved - began))
+                if stopped:
+                    self.bar.write(f"Stopped after {episode + 1} episodes; go on with --resume.", file=sys.stderr)
+                    sys.exit(128 + stopped[0])
+        finally:
+            self.bar.close()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def record(self, episode, rollout, **figures):
+        """Keep one episode of every trial; every `log_every` episodes write the means since the last time to TensorBoard."""
+        self.log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
+        for name, values in figures.items():
+            self.sums[name] += values
+        done, every = episode + 1, self.args.log_every
+        if done % every:
+            return
+        recent, seconds = slice(done - every, done), time.monotonic() - self.clock
+        curves = self.log.means(recent)
+        steps = curves["episodic_length"] * every
+        curves.update(SPS=steps / seconds, **{name: total / every for name, total in self.sums.items()})
+        for name, values in curves.items():
+            for writer, value in zip(self.writers, values, strict=True):
+                writer.add_scalar(f"charts/{name}", value, done)
+        for total in self.sums.values():
+            total[:] = 0
+        best = f"{self.log.share_at_best(recent):.0%}"
+        score, speed = f"{curves['reward_per_step'].mean():.2f}", f"{steps.sum() / seconds:.0f}"
+        self.bar.set_postfix({"reward/step": score, "trials at best": best, "steps/s": speed}, refresh=False)
+        self.clock = time.monotonic()
+
+    def finish(self, policy):
+        """Write what was asked for and, last of all, the file that marks the run as finished."""
+        args, directory = self.args, self.args.run_dir
+        for writer in self.writers:
+            writer.close()
+        if args.save_model:
+            team = {"method": METHOD, "env": args.env, "env_args": list(args.env_args), "max_steps": self.env.world.max_steps}
+            with envs.complete_file(directory / "policy.pt") as file:
+                torch.save({**team, "hidden": list(args.hidden), "params": [p.detach() for p in policy.params]}, file)
+        if args.capture_video:
+            play(self.env, policy, args, 1, directory / "team.gif")
+        with envs.complete_file(self.result) as file:
+            np.savez(file, returns=self.log.returns, lengths=self.log.lengths, outcomes=self.log.outcomes)
+        self.checkpoint.unlink(missing_ok=True)
+        print(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {self.log.summary()}")
+
+
+def play(env, policy, args, num_episodes, video):
+    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
+    rng, rollout, frames = np.random.default_rng(args.seed), Rollout(env), []
+    log = envs.EpisodeLog(env.world, env.num_envs, num_episodes)
+    for episode in range(num_episodes):
+        uniforms = None if args.greedy else rng.random((env.num_envs, env.world.max_steps, env.world.num_agents))
+        collect(env, policy, uniforms, rollout, frames if episode == 0 else None)
+        log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
+    try:
+        envs.save_gif(video, frames)
+    except OSError as error:
+        raise envs.UsageError(f"cannot write {video}: {error.strerror}.") from error
+    return log
+
+
+def evaluate(args):
+    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
+    try:
+        saved = torch.load(args.evaluate, weights_only=True)
+        world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
+        teams = len(saved["params"][0]) // world.num_agents
+        sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
+        policy = StackedMLP([np.random.default_rng(0)] * teams, world.num_agents, sizes)
+        for param, kept in zip(policy.params, saved["params"], strict=True):
+            param.data.copy_(kept)
+    except Exception as error:  # whatever can be wrong with a file
+        raise envs.UsageError(f"{args.evaluate} is not a policy.pt that --save-model wrote.") from error
+    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
+    log = play(envs.GridVectorEnv(world, teams), policy, args, num_episodes, video)
+    print(f"{args.evaluate}: {num_episodes} episodes of {teams} teams, {log.summary(share=1.0)}; one of them in {video}")
+
+
+def main():
+    try:
+        args = tyro.cli(Args, description=__doc__)
+        evaluate(args) if args.evaluate else train(args)
+    except envs.UsageError as error:
+        print(f"{METHOD}.py: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
