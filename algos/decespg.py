@@ -1,8 +1,8 @@
 """DecESPG: REINFORCE with private exploration bonuses and a selective memory (Algorithm 1 of the paper), on the base of pg.py.
 
-1. Every agent remembers its last m pairs u = (o, a). A Gaussian process says how much a new pair has been visited, eta(u) in (0, 1]
-   (Eqs. 5-7), and the agent's reward becomes r' = r + beta EB(u) with EB(u) = -log eta(u) (Eqs. 8-9).
-2. For every terminal state the team keeps its best episodes, and the gradient of Eq. 14 gets their gradients on top (Eqs. 15-16).
+1. Every agent remembers its last m pairs u = (o, a). A Gaussian process says how much a new pair has been visited, eta(u) in
+   (0, 1] (Eqs. 5-7), and the agent's reward becomes r' = r + beta EB(u) with EB(u) = -log eta(u) (Eqs. 8-9).
+2. For every terminal state the team keeps its best episodes; their gradients are added to that of Eq. 14 (Eqs. 15-16).
 
 Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021).
 
@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import time
+from copy import copy
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from itertools import pairwise
@@ -63,23 +64,23 @@ class Args:
     num_trials: int = 1
     """independent trials, trained side by side in this process"""
     num_episodes: int | None = None
-    """training episodes of each trial (default: Table 1); with --evaluate, episodes to play (default: 100)"""
+    """training episodes of each trial (None: Table 1); with --evaluate, episodes to play (None: 100)"""
     max_steps: int | None = None
-    """time limit of an episode in steps (default: Table 1)"""
+    """time limit of an episode in steps (None: Table 1)"""
     hidden: tuple[int, ...] | None = None
-    """widths of the hidden layers (default: Table 1)"""
+    """widths of the hidden layers (None: Table 1)"""
     gamma: float | None = None
-    """discount factor (default: Table 1)"""
+    """discount factor (None: Table 1)"""
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: float | None = None
-    """step size of the policies (default: tuned for world and optimiser)"""
+    """step size of the policies (None: tuned for world and optimiser)"""
     log_every: int = 100
     """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
     run_dir: Path | None = None
-    """where the run's files go (default: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
+    """where the run's files go (None: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
     checkpoint_every: float = 60.0
-    """seconds between two checkpoints (longer where writing one would take over 2 %% of the time)"""
+    """seconds between two checkpoints (longer where writing one would take over 2 % of the time)"""
     resume: bool = False
     """go on from the checkpoint in the run's directory"""
     overwrite: bool = False
@@ -93,13 +94,13 @@ class Args:
     greedy: bool = False
     """with --evaluate: take the likeliest actions instead of drawing from the policies"""
     beta: float | None = None
-    """weight of the exploration bonus, in units of reward (beta of Eq. 9; default: tuned for world and optimiser)"""
+    """weight of the exploration bonus, in units of reward (beta of Eq. 9; None: tuned for world and optimiser)"""
     window: int = 50
     """visits that each agent remembers (m of Section 3.1.4)"""
     sigma: float = 0.5
-    """width of the kernel (sigma of Eq. 5) in cells where agents observe positions, in units of the observation where it is one-hot"""
+    """width of the kernel (sigma of Eq. 5), in cells where agents observe positions, else in units of the observation"""
     noise: float = 0.01
-    """variance of the noise in a visit (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
+    """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
     slots: int = 10
     """episodes that the memory keeps for each terminal state; 0 switches it off"""
 
@@ -124,6 +125,12 @@ class StackedMLP:
             x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
         return x
 
+    def subset(self, nets):
+        """A copy of some of the networks."""
+        part = copy(self)
+        part.params = [param[nets] for param in self.params]
+        return part
+
 
 class StackedOptimizer:
     """Gradient descent for stacked networks, every network on its own.
@@ -141,17 +148,18 @@ class StackedOptimizer:
     @torch.no_grad()
     def step(self, grads, active=None):
         """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        mask = torch.ones_like(self.count) if active is None else active.view(-1, 1, 1).float()
+        rate = self.learning_rate if active is None else self.learning_rate * active.view(-1, 1, 1).float()
         if self.kind == "sign":
             for param, grad in zip(self.params, grads, strict=True):
-                param.addcdiv_(grad * mask, grad.abs().add_(1e-8), value=-self.learning_rate)
+                param -= rate * (grad / grad.abs().add_(1e-8))
             return
-        self.count += mask
-        correction1, correction2 = 1 - 0.9 ** self.count.clamp(min=1), 1 - 0.999 ** self.count.clamp(min=1)
+        kept = 0.0 if active is None else 1.0 - active.view(-1, 1, 1).float()
+        self.count += 1.0 - kept
+        correction1, correction2 = (1 - decay ** self.count.clamp(min=1) for decay in (0.9, 0.999))
         for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
-            first += (0.1 * mask) * (grad - first)
-            second += (0.001 * mask) * (grad * grad - second)
-            param.addcdiv_(first * (mask / correction1), (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
+            first += 0.1 * (1.0 - kept) * (grad - first)
+            second += 0.001 * (1.0 - kept) * (grad * grad - second)
+            param -= rate * (first / correction1 / (second / correction2).sqrt_().add_(1e-8))
 
 
 @njit(cache=True)
@@ -194,21 +202,27 @@ def collect(env, policy, uniforms, rollout, frames=None):
     The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
     Pictures of the first world are appended to `frames` if it is a list.
     """
-    teams = (env.num_envs, env.world.num_agents)
+    num_agents = env.world.num_agents
     obs, _ = env.reset()
     rollout.lengths[:] = 0
-    running = np.ones(env.num_envs, bool)
+    running, playing, actor = np.ones(env.num_envs, bool), np.arange(env.num_envs), policy
+    actions = np.zeros(rollout.actions.shape[1:], np.int64)
     for t in range(env.world.max_steps):
-        logits = policy(torch.from_numpy(obs).view(teams[0] * teams[1], 1, -1)).view(*teams, -1).numpy()
-        actions = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[:, t])
+        logits = actor(torch.from_numpy(obs[playing]).view(len(playing) * num_agents, 1, -1)).numpy()
+        logits = logits.reshape(len(playing), num_agents, -1)
+        actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
         rollout.obs[t], rollout.actions[t] = obs, actions
         rollout.lengths += running
         obs, rollout.reward[t], terminated, truncated, info = env.step(actions)
         if frames is not None and running[0]:
             frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
         running = ~(terminated | truncated)
-        if not running.any():
+        num_running = np.count_nonzero(running)
+        if num_running == 0:
             break
+        if 2 * num_running <= len(playing):  # acting takes as long as there are networks: let those that wait go
+            playing = np.flatnonzero(running)
+            actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
     rollout.outcomes[:] = info["outcome"]
 
 
@@ -262,67 +276,76 @@ def merge_steps(obs, actions, weights, lengths, num_actions):
 
 
 @njit(cache=True)
-def visit_counts(obs, actions, lengths, past_obs, past_actions, inverse, visits, sigma, noise):
-    """Go through an episode: the bounded visit count eta of each step, then remember the step; all agents by themselves.
+def slide_inverse(inverse, product, kernel, slot, full, diagonal):
+    """Bring inverse = (K + noise I)^-1 [m, m] up to date, in place, when a new visit takes row `slot` of the ring.
 
-    obs [T, num_trials, num_agents, obs_dim], actions [T, num_trials, num_agents], lengths [num_trials] -> eta [T, num_trials, num_agents].
-    What is remembered stands in rings, visit number n at n mod m: past_obs [num_trials, num_agents, obs_dim, m],
-    past_actions [num_trials, num_agents, m], inverse = (K + noise I)^-1 [num_trials, num_agents, m, m] (0 where nothing is yet) and the number
-    of visits so far [num_trials]. As the rows of a ring are in no order, Eqs. 12-13 here replace row `slot`, not the first one.
+    kernel [m] holds the new visit's kernel values (0 where nothing is remembered), product = inverse @ kernel, and diagonal is
+    1 + noise. Eqs. 12-13 number the rows from the oldest to the newest; in a ring the newest takes the row of the oldest.
+    """
+    m = len(kernel)
+    # B = H - f f^T / e (Eq. 13) is the inverse without the visit that stood in `slot`: its row is [.., e, ..] with f around e.
+    # Before the ring is full nothing stood there, B is the old inverse, and what follows is Eq. 11 with its e, g for B h, s.
+    row, per_e = inverse[slot].copy(), 1.0 / inverse[slot, slot] if full else 0.0
+    for c in range(m):
+        product[c] -= kernel[slot] * row[c]
+    kernel[slot] = 0.0  # kernel is h now
+    projection = product[slot] * per_e
+    s = diagonal
+    for c in range(m):
+        product[c] -= projection * row[c]  # product becomes B h
+        s -= kernel[c] * product[c]
+    s = 1.0 / s
+    # B + s (B h)(B h)^T, bordered by -s B h and s.
+    for r in range(m):
+        gain, loss = s * product[r], per_e * row[r]
+        if gain != 0.0 or loss != 0.0:
+            for c in range(m):
+                inverse[r, c] += gain * product[c] - loss * row[c]
+    for c in range(m):
+        inverse[slot, c] = inverse[c, slot] = -s * product[c]
+    inverse[slot, slot] = s
+
+
+@njit(cache=True)
+def visit_counts(obs, actions, lengths, past_obs, past_actions, inverses, visits, sigma, noise):
+    """The bounded visit count eta of each step of an episode, which is then remembered; every agent by itself.
+
+    obs [T, num_trials, num_agents, obs_dim], actions [T, num_trials, num_agents], lengths [num_trials] -> eta, shaped as
+    actions, 1 beyond the episode's end. What is remembered stands in rings, visit number n in row n mod m:
+    past_obs [num_trials, num_agents, obs_dim, m], past_actions [.., m], inverses [.., m, m]; visits [num_trials] counts them.
     """
     _, trials, agents, dim = obs.shape
     m = past_actions.shape[2]
     eta = np.ones(actions.shape)
-    kernel, product, column = np.empty(m), np.empty(m), np.empty(m)
+    kernel, product = np.empty(m), np.empty(m)
     for k in range(trials):
         for i in range(agents):
-            inv, seen_obs, seen_actions = inverse[k, i], past_obs[k, i], past_actions[k, i]
+            inverse, ring_obs, ring_actions = inverses[k, i], past_obs[k, i], past_actions[k, i]
             for t in range(lengths[k]):
                 visit = visits[k] + t
-                slot, full = visit % m, visit >= m
-
                 # Eq. 5 with C = 1, for u = (o, one-hot a): two different actions are a squared distance of 2 apart.
-                for j in range(m):
-                    kernel[j] = 2.0 * (seen_actions[j] != actions[t, k, i])
+                for r in range(m):
+                    kernel[r] = 2.0 * (ring_actions[r] != actions[t, k, i])
                 for d in range(dim):
-                    for j in range(m):
-                        kernel[j] += (obs[t, k, i, d] - seen_obs[d, j]) ** 2
-                for j in range(m):
-                    exponent = kernel[j] / (2.0 * sigma * sigma)
-                    kernel[j] = np.exp(-exponent) if exponent < 40.0 and j < visit else 0.0  # exp(-40) is 0 beside 1
+                    for r in range(m):
+                        kernel[r] += (obs[t, k, i, d] - ring_obs[d, r]) ** 2
+                for r in range(m):
+                    exponent = kernel[r] / (2.0 * sigma * sigma)
+                    kernel[r] = np.exp(-exponent) if r < visit and exponent < 40.0 else 0.0  # exp(-40) is nothing beside 1
 
-                # Eq. 7 with targets 1, because every remembered pair was visited: eta = k^T inv 1.
+                # Eq. 7 with targets 1, because every remembered pair was visited: eta = kernel^T inverse 1.
                 product[:] = 0.0
-                for j in range(m):
-                    if kernel[j] > 0.0:
-                        for l in range(m):
-                            product[l] += inv[j, l] * kernel[j]
+                for r in range(m):
+                    if kernel[r] > 0.0:
+                        for c in range(m):
+                            product[c] += kernel[r] * inverse[r, c]
                 eta[t, k, i] = product.sum()
 
-                # Forget the visit in `slot` (B of Eq. 13, from Eq. 12; before the ring is full there is none) and append the new
-                # one (Eq. 11, and again Eq. 13): product becomes B h, and the inverse B + s (B h)(B h)^T, bordered by -s B h and s.
-                column[:] = inv[slot]
-                forget = 1.0 / column[slot] if full else 0.0
-                for l in range(m):
-                    product[l] -= kernel[slot] * column[l]
-                kernel[slot] = 0.0
-                projection = product[slot] * forget
-                gain = 1.0 + noise
-                for l in range(m):
-                    product[l] -= projection * column[l]
-                    gain -= kernel[l] * product[l]
-                s = 1.0 / gain
-                for j in range(m):
-                    left, right = s * product[j], forget * column[j]
-                    if left != 0.0 or right != 0.0:
-                        for l in range(m):
-                            inv[j, l] += left * product[l] - right * column[l]
-                for l in range(m):
-                    inv[slot, l] = inv[l, slot] = -s * product[l]
-                inv[slot, slot] = s
-                seen_actions[slot] = actions[t, k, i]
+                slot = visit % m
+                slide_inverse(inverse, product, kernel, slot, visit >= m, 1.0 + noise)
+                ring_actions[slot] = actions[t, k, i]
                 for d in range(dim):
-                    seen_obs[d, slot] = obs[t, k, i, d]
+                    ring_obs[d, slot] = obs[t, k, i, d]
     for k in range(trials):
         visits[k] += lengths[k]
     return eta
@@ -340,10 +363,10 @@ class VisitNovelty:
         self.state = [self.obs, self.actions, self.inverse, self.visits]
 
     def bonus(self, obs, actions, lengths):
-        """EB = -log eta of every step of an episode (Eq. 8), [T, num_trials, num_agents], and the shares of steps at both clamps.
+        """EB = -log eta of each step of an episode (Eq. 8), [T, num_trials, num_agents], and the shares of clamped steps.
 
-        eta lies in (0, 1] in the paper; here it is clamped to [1e-3, 1], because pairs unlike any remembered one have eta = 0 and
-        pairs between several remembered ones may have eta > 1.
+        In the paper eta lies in (0, 1]; here it is clamped to [1e-3, 1], because a pair unlike all that is remembered has
+        eta = 0 and a pair between several remembered ones may have eta > 1.
         """
         eta = visit_counts(obs, actions, lengths, *self.state, self.sigma, self.noise)
         steps = lengths * eta.shape[2]
@@ -366,7 +389,10 @@ class SelectiveMemory:
         self.replays = [None] * env.num_envs
 
     def remember(self, rollout, returns):
-        """Keep each trial's episode if it is better than the worst one kept for its terminal state; returns [T, num_trials] without bonus."""
+        """Keep each trial's episode if it is better than the worst one kept for its terminal state.
+
+        returns [T, num_trials] are those of the original reward; on a tie the older episode stays.
+        """
         for k, (outcome, length) in enumerate(zip(rollout.outcomes, rollout.lengths, strict=True)):
             values = self.value[k, outcome]
             if values.size and returns[0, k] > values.min():
@@ -379,8 +405,8 @@ class SelectiveMemory:
     def replay(self):
         """The steps of the second term of Eq. 16, merged as by `merge_steps`: sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j.
 
-        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. The stored returns
-        stay as they are, so the steps are merged again only when the memory has changed.
+        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. What is stored
+        does not change, so the steps are merged again only when a better episode has come.
         """
         changed = [k for k, replay in enumerate(self.replays) if replay is None]
         for k in changed:
@@ -388,7 +414,8 @@ class SelectiveMemory:
         if changed:
             rows = max(obs.shape[1] for obs, _ in self.replays)
             agents, dim = self.obs.shape[-2:]
-            self.stacked = [np.zeros((len(self.replays) * agents, rows, width), np.float32) for width in (dim, self.num_actions)]
+            nets = len(self.replays) * agents
+            self.stacked = [np.zeros((nets, rows, width), np.float32) for width in (dim, self.num_actions)]
             for k, replay in enumerate(self.replays):
                 for stacked, part in zip(self.stacked, replay, strict=True):
                     stacked[k * agents : (k + 1) * agents, : part.shape[1]] = part

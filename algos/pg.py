@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from copy import copy
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from itertools import pairwise
@@ -61,23 +62,23 @@ class Args:
     num_trials: int = 1
     """independent trials, trained side by side in this process"""
     num_episodes: int | None = None
-    """training episodes of each trial (default: Table 1); with --evaluate, episodes to play (default: 100)"""
+    """training episodes of each trial (None: Table 1); with --evaluate, episodes to play (None: 100)"""
     max_steps: int | None = None
-    """time limit of an episode in steps (default: Table 1)"""
+    """time limit of an episode in steps (None: Table 1)"""
     hidden: tuple[int, ...] | None = None
-    """widths of the hidden layers (default: Table 1)"""
+    """widths of the hidden layers (None: Table 1)"""
     gamma: float | None = None
-    """discount factor (default: Table 1)"""
+    """discount factor (None: Table 1)"""
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: float | None = None
-    """step size of the policies (default: tuned for world and optimiser)"""
+    """step size of the policies (None: tuned for world and optimiser)"""
     log_every: int = 100
     """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
     run_dir: Path | None = None
-    """where the run's files go (default: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
+    """where the run's files go (None: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
     checkpoint_every: float = 60.0
-    """seconds between two checkpoints (longer where writing one would take over 2 %% of the time)"""
+    """seconds between two checkpoints (longer where writing one would take over 2 % of the time)"""
     resume: bool = False
     """go on from the checkpoint in the run's directory"""
     overwrite: bool = False
@@ -112,6 +113,12 @@ class StackedMLP:
             x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
         return x
 
+    def subset(self, nets):
+        """A copy of some of the networks."""
+        part = copy(self)
+        part.params = [param[nets] for param in self.params]
+        return part
+
 
 class StackedOptimizer:
     """Gradient descent for stacked networks, every network on its own.
@@ -129,17 +136,18 @@ class StackedOptimizer:
     @torch.no_grad()
     def step(self, grads, active=None):
         """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        mask = torch.ones_like(self.count) if active is None else active.view(-1, 1, 1).float()
+        rate = self.learning_rate if active is None else self.learning_rate * active.view(-1, 1, 1).float()
         if self.kind == "sign":
             for param, grad in zip(self.params, grads, strict=True):
-                param.addcdiv_(grad * mask, grad.abs().add_(1e-8), value=-self.learning_rate)
+                param -= rate * (grad / grad.abs().add_(1e-8))
             return
-        self.count += mask
-        correction1, correction2 = 1 - 0.9 ** self.count.clamp(min=1), 1 - 0.999 ** self.count.clamp(min=1)
+        kept = 0.0 if active is None else 1.0 - active.view(-1, 1, 1).float()
+        self.count += 1.0 - kept
+        correction1, correction2 = (1 - decay ** self.count.clamp(min=1) for decay in (0.9, 0.999))
         for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
-            first += (0.1 * mask) * (grad - first)
-            second += (0.001 * mask) * (grad * grad - second)
-            param.addcdiv_(first * (mask / correction1), (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
+            first += 0.1 * (1.0 - kept) * (grad - first)
+            second += 0.001 * (1.0 - kept) * (grad * grad - second)
+            param -= rate * (first / correction1 / (second / correction2).sqrt_().add_(1e-8))
 
 
 @njit(cache=True)
@@ -182,21 +190,27 @@ def collect(env, policy, uniforms, rollout, frames=None):
     The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
     Pictures of the first world are appended to `frames` if it is a list.
     """
-    teams = (env.num_envs, env.world.num_agents)
+    num_agents = env.world.num_agents
     obs, _ = env.reset()
     rollout.lengths[:] = 0
-    running = np.ones(env.num_envs, bool)
+    running, playing, actor = np.ones(env.num_envs, bool), np.arange(env.num_envs), policy
+    actions = np.zeros(rollout.actions.shape[1:], np.int64)
     for t in range(env.world.max_steps):
-        logits = policy(torch.from_numpy(obs).view(teams[0] * teams[1], 1, -1)).view(*teams, -1).numpy()
-        actions = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[:, t])
+        logits = actor(torch.from_numpy(obs[playing]).view(len(playing) * num_agents, 1, -1)).numpy()
+        logits = logits.reshape(len(playing), num_agents, -1)
+        actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
         rollout.obs[t], rollout.actions[t] = obs, actions
         rollout.lengths += running
         obs, rollout.reward[t], terminated, truncated, info = env.step(actions)
         if frames is not None and running[0]:
             frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
         running = ~(terminated | truncated)
-        if not running.any():
+        num_running = np.count_nonzero(running)
+        if num_running == 0:
             break
+        if 2 * num_running <= len(playing):  # acting takes as long as there are networks: let those that wait go
+            playing = np.flatnonzero(running)
+            actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
     rollout.outcomes[:] = info["outcome"]
 
 

@@ -1,0 +1,119 @@
+"""Speed on one core: the worlds, the scripts at 1 and 20 trials, the exploration bonus, and start-up.
+
+    python benchmark/speed.py                            # everything, some minutes; --quick for a tenth of the episodes
+
+Prints tables of figures and of their ratios, all from this one run; run it on an otherwise idle machine.
+"""
+
+import dataclasses
+import importlib
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "algos")]
+import envs
+
+METHODS = ("pg", "decespg")
+EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
+
+
+def print_table(title, head, rows):
+    """A Markdown table."""
+    print(f"\n{title}\n\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
+    for row in rows:
+        print(f"| {' | '.join(map(str, row))} |", flush=True)
+
+
+def world_speed(name, num_envs, seconds=1.0):
+    """Environment steps per second of the vector face under random play, resets included."""
+    env = envs.make_vec(name, num_envs)
+    rng = np.random.default_rng(0)
+    actions = rng.integers(0, env.world.num_actions, (env.world.max_steps, num_envs, env.world.num_agents))
+    env.reset()
+    env.step(actions[0])
+    steps, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        env.reset()
+        for joint in actions:
+            env.step(joint)
+        steps += len(actions) * num_envs
+    return steps / (time.perf_counter() - start)
+
+
+def script_speed(method, env, num_trials, num_episodes):
+    """Seconds of a training run and its useful steps (of trials whose episode still runs) per second."""
+    script = importlib.import_module(method)
+    with tempfile.TemporaryDirectory() as folder:
+        args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up")
+        script.train(args)
+        args = dataclasses.replace(args, num_episodes=num_episodes, run_dir=Path(folder) / "run")
+        start = time.perf_counter()
+        steps = script.train(args).log.lengths.sum()
+        seconds = time.perf_counter() - start
+    return seconds, steps / seconds
+
+
+def bonus_speed(window, visits=20_000):
+    """Microseconds per remembered visit of DecESPG's Gaussian process, along random play in findtreasure."""
+    script, env = importlib.import_module("decespg"), envs.make_vec("findtreasure")
+    world, rng = env.world, np.random.default_rng(0)
+    obs = np.zeros((visits, 1, world.num_agents, world.obs_dim), np.float32)
+    actions = rng.integers(0, world.num_actions, (visits, 1, world.num_agents))
+    for t in range(visits):
+        if t % world.max_steps == 0:
+            obs[t], _ = env.reset()
+        if t + 1 < visits:
+            obs[t + 1] = env.step(actions[t])[0]
+    novelty = script.VisitNovelty(1, world.num_agents, world.obs_dim, window, 0.5 * world.cell, 0.01)
+    novelty.bonus(obs[:window], actions[:window], np.array([window]))
+    start = time.perf_counter()
+    novelty.bonus(obs, actions, np.array([visits]))
+    return (time.perf_counter() - start) / (visits * world.num_agents) * 1e6
+
+
+def startup_seconds(method):
+    """Seconds of a whole run of two episodes with warm caches: what a user waits before training begins."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, ROOT / "algos" / f"{method}.py", "--num-episodes", "2", "--run-dir"]
+        start = time.perf_counter()
+        subprocess.run([*command, folder], check=True, capture_output=True)
+        return time.perf_counter() - start
+
+
+def main(quick: bool = False):
+    """Measure and print.
+
+    Args:
+        quick: train for a tenth of Table 1's episodes
+    """
+    copies = (1, 20, 200)
+    rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
+    print_table("Million environment steps per second:", ["world", *(f"{n} copies" for n in copies)], rows)
+
+    rows, seconds = [], {}
+    for method in METHODS:
+        for env, episodes in EPISODES.items():
+            episodes //= 10 if quick else 1
+            one, one_rate = script_speed(method, env, 1, episodes)
+            many, many_rate = script_speed(method, env, 20, episodes)
+            seconds[method, env] = many
+            rows.append([method, env, episodes, f"{one:.0f}", f"{one_rate:.0f}", f"{many:.0f}", f"{many_rate:.0f}"])
+            rows[-1] += [f"{many_rate / one_rate:.1f}", f"{many / seconds['pg', env]:.2f}"]
+    head = ["script", "world", "episodes", "1 trial: s", "steps/s", "20 trials: s", "steps/s", "20 : 1 trials", "time : pg"]
+    print_table("Training, useful environment steps per second:", head, rows)
+
+    rows = [[m, f"{bonus_speed(m):.1f}"] for m in (50, 100, 200)]
+    print_table("The exploration bonus:", ["window m", "microseconds per visit"], rows)
+    rows = [[method, f"{startup_seconds(method):.1f}"] for method in METHODS]
+    print_table("Start-up, with two episodes:", ["script", "seconds"], rows)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,136 @@
+"""The tuning rule, the same for every method: 3 learning rates x 3 values of one number of the method's own, for each optimiser.
+
+Each cell of the grid trains 5 teams (seeds 1000-1004, which no reported result uses) for a quarter of Table 1's episodes. The best cell has
+the highest mean reward per step over the last 5 % of the episodes; of equal ones, the higher mean over all episodes. The paper's
+figures play no part. Finished cells are not run again, interrupted ones go on.
+
+    python benchmark/tune.py pg decespg --jobs 2         # writes benchmark/tuning/pg.md and decespg.md
+"""
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import envs
+
+EPISODES = {"findtreasure": 2500, "pushbox": 5000}  # a quarter of Table 1
+LEARNING_RATES = {"sign": (1e-4, 3e-4, 1e-3), "adam": (3e-4, 1e-3, 3e-3)}
+# The number of a method's own that is tuned, and its values in each world; pg has none.
+OWN = {
+    "pg": {world: ("", (None,)) for world in EPISODES},
+    "decespg": {"findtreasure": ("beta", (0.03, 0.1, 0.3)), "pushbox": ("beta", (1.0, 3.0, 10.0))},
+}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the grid."""
+
+    method: str
+    env: str
+    optimizer: str
+    learning_rate: float
+    own: str
+    value: float | None
+
+    @property
+    def run_dir(self):
+        own = f"-{self.own}={self.value}" if self.own else ""
+        return ROOT / "runs" / "tuning" / self.method / self.env / f"{self.optimizer}-learning_rate={self.learning_rate}{own}"
+
+    @property
+    def result(self):
+        return self.run_dir / "episodes.npz"
+
+    def run(self):
+        """Train; returns the last line of what the script says if it fails, None if it does not."""
+        if self.result.exists():
+            return None
+        command = [sys.executable, ROOT / "algos" / f"{self.method}.py", "--env", self.env, "--seed", 1000, "--num-trials", 5]
+        command += ["--num-episodes", EPISODES[self.env], "--optimizer", self.optimizer, "--learning-rate", self.learning_rate]
+        command += ["--run-dir", self.run_dir, *([f"--{self.own}", self.value] if self.own else [])]
+        command += ["--resume"] if (self.run_dir / "checkpoint.pt").exists() else []
+        done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
+        return None if done.returncode == 0 else done.stderr.strip().splitlines()[-1]
+
+    def scores(self):
+        """Mean reward per step over the last 5 % of the episodes and over all, and the mean of each trial over the last 5 %."""
+        episodes = np.load(self.result)
+        score = envs.reward_per_step(episodes["returns"], episodes["lengths"])
+        trials = score[:, -score.shape[1] // 20 :].mean(1)
+        return trials.mean(), score.mean(), trials
+
+
+def grid(method):
+    """All cells of a method."""
+    return [
+        Cell(method, env, optimizer, rate, own, value)
+        for env, (own, values) in OWN[method].items()
+        for optimizer, rates in LEARNING_RATES.items()
+        for rate, value in product(rates, values)
+    ]
+
+
+def table(method):
+    """The whole grid as a Markdown page; the best cell of each world and optimiser in bold."""
+    lines = [
+        f"# {method}: the tuning grid",
+        "",
+        f"Made by `python benchmark/tune.py {method}`; the rule is in its docstring.",
+        "",
+    ]
+    own = next(iter(OWN[method].values()))[0]
+    lines += [
+        f"| world | optimiser | learning rate | {own or '-'} | last 5 % | worst trial | all episodes |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    cells = grid(method)
+    for group in dict.fromkeys((cell.env, cell.optimizer) for cell in cells):
+        members = [cell for cell in cells if (cell.env, cell.optimizer) == group]
+        best = max(members, key=lambda cell: cell.scores()[:2])
+        for cell in members:
+            last, overall, trials = cell.scores()
+            value = "-" if cell.value is None else f"{cell.value:g}"
+            row = [*group, f"{cell.learning_rate:g}", value, f"{last:.2f}", f"{trials.min():.2f}", f"{overall:.2f}"]
+            lines.append("| " + " | ".join(f"**{word}**" if cell is best else word for word in row) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional], jobs: int = 2):
+    """Run the tuning grid of some methods and write its tables.
+
+    Args:
+        methods: scripts of algos/ without .py
+        jobs: runs at the same time, one core each
+    """
+    for method in methods:
+        if method not in OWN:
+            print(f"tune.py: there is no grid for {method!r}; there is one for {', '.join(OWN)}.", file=sys.stderr)
+            sys.exit(2)
+    cells = [cell for method in methods for cell in grid(method)]
+    with ThreadPoolExecutor(jobs) as pool:
+        errors = list(tqdm(pool.map(Cell.run, cells), total=len(cells), unit="run"))
+    for cell, error in zip(cells, errors, strict=True):
+        if error:
+            print(f"{cell.run_dir}: {error}", file=sys.stderr)
+    if any(errors):
+        sys.exit(1)
+    for method in methods:
+        path = ROOT / "benchmark" / "tuning" / f"{method}.md"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(table(method))
+        print(f"wrote {path}\n\n{table(method)}")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
