@@ -422,18 +422,12 @@ class SelectiveMemory:
         return self.stacked
 
     def _merge(self, k):
-        chosen = np.argwhere(self.value[k] > 0)
-        total = self.value[k][self.value[k] > 0].sum()
-        obs, actions, weights = [], [], []
-        for outcome, slot in chosen:
-            length = self.lengths[k, outcome, slot]
-            obs.append(self.obs[k, outcome, slot, :length])
-            actions.append(self.actions[k, outcome, slot, :length])
-            weights.append(self.value[k, outcome, slot] / total / length * self.returns[k, outcome, slot, :length])
-        agents, dim = self.obs.shape[-2:]
-        obs = np.concatenate([np.zeros((0, agents, dim), np.float32), *obs])
-        actions = np.concatenate([np.zeros((0, agents), np.int64), *actions])
-        weights = np.repeat(np.concatenate([np.zeros(0), *weights])[:, None], agents, axis=1)
+        """The steps of trial k's episodes, each weighted by w_i G*_t / T_i."""
+        value = np.where(self.value[k] > 0, self.value[k], 0.0)  # [outcomes, slots]
+        scale = value / (value.sum() or 1.0) / np.maximum(self.lengths[k], 1)
+        steps = np.arange(self.returns.shape[-1]) < (self.lengths[k] * (value > 0))[:, :, None]  # [outcomes, slots, max_steps]
+        obs, actions, weights = self.obs[k][steps], self.actions[k][steps], (scale[:, :, None] * self.returns[k])[steps]
+        weights = np.repeat(weights[:, None], obs.shape[1], axis=1)
         return merge_steps(obs[:, None], actions[:, None], weights[:, None], np.array([len(obs)]), self.num_actions)
 
 

@@ -1,8 +1,8 @@
-"""The tuning rule, the same for every method: 3 learning rates x 3 values of one number of the method's own, for each optimiser.
+"""The tuning rule, the same for every method: 3 learning rates x 3 values of one number of its own, for each optimiser.
 
-Each cell of the grid trains 5 teams (seeds 1000-1004, which no reported result uses) for a quarter of Table 1's episodes. The best cell has
-the highest mean reward per step over the last 5 % of the episodes; of equal ones, the higher mean over all episodes. The paper's
-figures play no part. Finished cells are not run again, interrupted ones go on.
+Each cell of the grid trains 5 teams (seeds 1000-1004, which no reported result uses) for a quarter of Table 1's episodes. The
+best cell has the highest mean reward per step over the last 5 % of the episodes; of equal ones, the higher mean over all. The
+paper's figures play no part. Finished cells are not run again, interrupted ones go on.
 
     python benchmark/tune.py pg decespg --jobs 2         # writes benchmark/tuning/pg.md and decespg.md
 """
@@ -27,7 +27,7 @@ EPISODES = {"findtreasure": 2500, "pushbox": 5000}  # a quarter of Table 1
 LEARNING_RATES = {"sign": (1e-4, 3e-4, 1e-3), "adam": (3e-4, 1e-3, 3e-3)}
 # The number of a method's own that is tuned, and its values in each world; pg has none.
 OWN = {
-    "pg": {world: ("", (None,)) for world in EPISODES},
+    "pg": dict.fromkeys(EPISODES, ("", (None,))),
     "decespg": {"findtreasure": ("beta", (0.03, 0.1, 0.3)), "pushbox": ("beta", (1.0, 3.0, 10.0))},
 }
 
@@ -83,17 +83,10 @@ def grid(method):
 
 def table(method):
     """The whole grid as a Markdown page; the best cell of each world and optimiser in bold."""
-    lines = [
-        f"# {method}: the tuning grid",
-        "",
-        f"Made by `python benchmark/tune.py {method}`; the rule is in its docstring.",
-        "",
-    ]
     own = next(iter(OWN[method].values()))[0]
-    lines += [
-        f"| world | optimiser | learning rate | {own or '-'} | last 5 % | worst trial | all episodes |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ["world", "optimiser", "learning rate", own or "-", "last 5 %", "worst trial", "all episodes"]
+    lines = [f"# {method}: the tuning grid", "", f"Made by `python benchmark/tune.py {method}`, which says how.", ""]
+    lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     cells = grid(method)
     for group in dict.fromkeys((cell.env, cell.optimizer) for cell in cells):
         members = [cell for cell in cells if (cell.env, cell.optimizer) == group]
