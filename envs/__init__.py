@@ -1,24 +1,30 @@
 """Cooperative gridworlds for exploration research, and the statistics of their episodes.
 
     env = envs.make_vec("pushbox", num_envs=20)          # a gymnasium.vector.VectorEnv
+    env = envs.make("pushbox", render_mode="ansi")       # a PettingZoo ParallelEnv
     print(envs.optimum("findtreasure"))                  # the exact optimum, by search
     envs.draw(env.world, env.world.start)                # a picture; envs.save_gif makes a film of several
-    envs.WORLDS["pushbox"]                               # the worlds: each one's module is its documentation
+
+`envs.WORLDS` has the worlds by name; each one's module is its documentation. `python -m envs pushbox` plays one in a terminal.
 """
 
 import ast
 import inspect
 
-from envs.base import UsageError, World, check_number
+from envs.base import UsageError, World, check_number, check_whole
+from envs.cleaner import Cleaner
 from envs.drawing import draw, save_gif
 from envs.files import complete_file
 from envs.findtreasure import FindTreasure
+from envs.gotogether import GoTogether
+from envs.movebox import MoveBox
+from envs.parallel import GridParallelEnv
 from envs.pushbox import PushBox
 from envs.search import Optimum, find_optimum
 from envs.statistics import EpisodeLog, reward_per_step
 from envs.vector import GridVectorEnv
 
-WORLDS = {world.name: world for world in (FindTreasure, PushBox)}
+WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox)}
 
 
 def make_world(name: str, **options) -> World:
@@ -37,8 +43,13 @@ def make_vec(name: str, num_envs: int = 1, **options) -> GridVectorEnv:
     return GridVectorEnv(make_world(name, **options), num_envs)
 
 
+def make(name: str, render_mode: str | None = None, **options) -> GridParallelEnv:
+    """The world `name` as a PettingZoo `ParallelEnv`; see `GridParallelEnv`."""
+    return GridParallelEnv(make_world(name, **options), render_mode)
+
+
 def optimum(name: str, **options) -> Optimum:
-    """The exact optimum of the world `name`, by search over its rules; see `envs.search`."""
+    """The exact optimum of the world `name`, by search over its rules (of cleaner, a constructed one); see `envs.search`."""
     return find_optimum(make_world(name, **options))
 
 

@@ -26,8 +26,9 @@ class World:
     name: str
     action_names: tuple[str, ...]
     outcome_names: tuple[str, ...]  # the names of outcomes 1, 2, ...
+    sights: tuple[str, ...] = ()  # what the entries of a one-hot observation stand for; none where positions are observed
     best_outcome: int  # the outcome a good team ends in; 0 if the world has none
-    searchable = True  # small enough for `envs.optimum` to visit every state
+    searchable = True  # small enough for `envs.optimum` to visit every state; otherwise the world has a `plan`
     step = observe = None  # compiled functions, set by the subclass as staticmethod
 
     def __init__(self, rules, start, local_index, num_agents, obs_dim, cell, state_scale, max_steps):
@@ -50,6 +51,10 @@ class World:
     @property
     def num_actions(self) -> int:
         return len(self.action_names)
+
+    def plan(self):
+        """Joint actions [max_steps, num_agents] of a good team, in a world that is not searchable and never ends early."""
+        raise NotImplementedError
 
     def sketch(self, state):
         """The picture of `state` as `(height, width, shapes)`, see `envs.drawing`."""
@@ -101,32 +106,44 @@ def compile_batch(step, observe):
 
     They enclose `step` and `observe` and are compiled anew in every process (about half a second): numba's cache on disk would
     save them together with the rules that they were first compiled for, and an edited world would silently keep its old rules.
+    They take the worlds' `memory` [num_envs, 2 + state_dim]: each one's outcome, number of steps and state. One call with few
+    arguments does everything, because for a small batch most of the time goes into calling and making arrays.
     """
 
     @njit
-    def look(rules, cell, local_index, state_scale, state, obs, global_state, local_state):
-        """Write what is to be seen of the worlds' states: observations, global states, and the agents' own entries."""
-        for e in range(len(state)):
-            observe(rules, cell, state[e], obs[e])
-            for j in range(state.shape[1]):
-                global_state[e, j] = state[e, j] * state_scale[j]
+    def look(rules, cell, local_index, state_scale, memory, obs, global_state, local_state):
+        """Write what is to be seen of the worlds: observations, global states, and the agents' own entries."""
+        for e in range(len(memory)):
+            state = memory[e, 2:]
+            observe(rules, cell, state, obs[e])
+            for j in range(len(state)):
+                global_state[e, j] = state[j] * state_scale[j]
             for i in range(local_index.shape[0]):
                 for j in range(local_index.shape[1]):
-                    local_state[e, i, j] = state[e, local_index[i, j]]
+                    local_state[e, i, j] = state[local_index[i, j]]
 
     @njit
-    def advance(rules, num_actions, max_steps, state, clock, outcome, actions, reward, flags):
-        """One time step of every world that still runs. An ended one stays still at reward 0 and keeps flags and outcome."""
-        for e in range(len(state)):
+    def advance(
+        rules, cell, local_index, state_scale, memory, num_actions, max_steps, actions,
+        reward, terminated, truncated, outcome, obs, global_state, local_state,
+    ):  # fmt: skip
+        """One time step of every world that still runs, and a look. An ended one stays still at reward 0 and keeps its flags.
+
+        Returns False, and does nothing, if an action is none of the world's.
+        """
+        for e in range(len(memory)):
             for i in range(actions.shape[1]):
                 if not 0 <= actions[e, i] < num_actions:
-                    raise ValueError("an action is none of the world's actions 0, 1, ...")
-        for e in range(len(state)):
+                    return False
+        for e in range(len(memory)):
             reward[e] = 0.0
-            if outcome[e] == 0 and clock[e] < max_steps:
-                reward[e], outcome[e] = step(rules, state[e], actions[e])
-                clock[e] += 1
-            flags[0, e] = outcome[e] > 0  # terminated: the world itself has ended
-            flags[1, e] = outcome[e] == 0 and clock[e] >= max_steps  # truncated: cut by the time limit
+            if memory[e, 0] == 0 and memory[e, 1] < max_steps:
+                reward[e], memory[e, 0] = step(rules, memory[e, 2:], actions[e])
+                memory[e, 1] += 1
+            outcome[e] = memory[e, 0]
+            terminated[e] = outcome[e] > 0  # the world itself has ended
+            truncated[e] = outcome[e] == 0 and memory[e, 1] >= max_steps  # cut by the time limit
+        look(rules, cell, local_index, state_scale, memory, obs, global_state, local_state)
+        return True
 
-    return advance, look
+    return look, advance

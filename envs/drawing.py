@@ -1,4 +1,4 @@
-"""Pictures of the worlds in the style of a paper's figure, and GIFs of episodes.
+"""Pictures of the worlds in the style of a paper's figure, GIFs of episodes, and maps in letters for the terminal.
 
 A world says what it looks like by `world.sketch(state) -> (rows, columns, shapes)`; row 0 is the top. The shapes are
     ("cell", kind, row, column)            a cell in the colour of `kind`, one of CELLS
@@ -24,12 +24,16 @@ CELLS = {
     "lever": "#f2c500",
     "meeting": "#fdf0bd",
     "treasure": "#2c9f4b",
-    "goal": "#d9efdd",
+    "goal": "#b5e0bf",
     "near goal": "#fdf0bd",
     "far goal": "#b5e0bf",
     "dirt": "#a8d9b0",
 }
 BOXES = {"small box": "#e6c79b", "large box": "#c08f5a", "box": "#c08f5a"}
+LETTERS = {
+    **{"wall": "#", "door": "D", "open door": "o", "lever": "L", "meeting": "m", "treasure": "T", "goal": "g"},
+    **{"near goal": "n", "far goal": "f", "dirt": ".", "small box": "s", "large box": "B", "box": "B"},
+}
 # Red and blue first; the shades differ in lightness too, so that they can be told apart without red or green.
 AGENTS = ("#d62f2f", "#1f5fa8", "#f59a3c", "#7a3fa0", "#35b6cf", "#e58bc4", "#7d7d7d", "#5e3413")
 FINE = 4  # everything is drawn this many times larger and averaged, which smooths the edges and keeps even areas even
@@ -129,3 +133,31 @@ def save_gif(path, frames, fps=4):
     duration = [round(1000 / fps)] * len(rest) + [2000]
     with complete_file(path) as file:
         first.save(file, "GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=True)
+
+
+def text_map(world, state):
+    """The map of `state` of `world` in letters, with a last line that says what they mean.
+
+    A cell shows the numbers of its agents (and an arrow where they look), then the letter of its box or of the cell itself.
+    Cells are as wide as the fullest one, at least two letters.
+    """
+    rows, columns, shapes = world.sketch(state)
+    letters, agents, kinds = {}, {}, {}
+    for what, *shape in sorted(shapes, key=lambda shape: ("cell", "box", "agent").index(shape[0])):
+        if what == "agent":
+            index, row, column, facing = shape
+            agents[row, column] = f"{agents.get((row, column), '')}{index}{'' if facing is None else '^>v<'[facing]}"
+        else:
+            kind, row, column, cells = (*shape, 1)[:4]
+            kinds[kind] = LETTERS[kind]
+            letters.update({(row, column + k): LETTERS[kind] for k in range(cells)})
+    width = max(2, *map(len, agents.values()))
+    lines = [
+        "".join((agents.get((r, c), "") + letters.get((r, c), " ") * width)[:width] for c in range(columns))
+        for r in range(rows)
+    ]
+    if "wall" not in kinds:
+        edge = f"+{'-' * columns * width}+"
+        lines = [edge, *(f"|{line}|" for line in lines), edge]
+    legend = [" ".join(map(str, range(world.num_agents))) + " agents", *(f"{letter} {kind}" for kind, letter in kinds.items())]
+    return "\n".join([*lines, ", ".join(legend)])

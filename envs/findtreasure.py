@@ -27,6 +27,7 @@ from numba import njit
 
 from envs.base import UsageError, World, check_choice, check_whole, observe_own, observe_positions
 
+UP, DOWN, LEFT, RIGHT, WAIT = range(5)
 FREE, WALL, DOOR, LEVER, MEETING, TREASURE = range(6)
 TREASURE_REWARD, MEETING_REWARD, BUMP_REWARD = 100.0, 3.0, -0.1
 
@@ -37,17 +38,11 @@ def step(grid, state, actions):
     door_open = grid[state[0], state[1]] == LEVER or grid[state[2], state[3]] == LEVER
     reward = 0.0
     for i in range(2):
-        row, column, other = state[2 * i], state[2 * i + 1], 2 * (1 - i)
-        if actions[i] == 0:
-            row -= 1
-        elif actions[i] == 1:
-            row += 1
-        elif actions[i] == 2:
-            column -= 1
-        elif actions[i] == 3:
-            column += 1
-        else:
+        if actions[i] == WAIT:
             continue
+        row = state[2 * i] + (actions[i] == DOWN) - (actions[i] == UP)
+        column = state[2 * i + 1] + (actions[i] == RIGHT) - (actions[i] == LEFT)
+        other = 2 * (1 - i)
         teammate = row == state[other] and column == state[other + 1]
         closed = grid[row, column] == DOOR and not door_open
         if grid[row, column] == WALL or closed or teammate:

@@ -131,6 +131,7 @@ class PushBox(World):
 
     name = "pushbox"
     action_names = ("forward", "turn left", "turn right", "wait")
+    sights = ("small box", "large box", "empty", "boundary", "teammate")  # as numbered above
     outcome_names = ("small left", "small right", "both small", "large")
     best_outcome = 4
     step, observe = staticmethod(step), staticmethod(observe)

@@ -35,27 +35,31 @@ class Optimum:
     fewest:        for every outcome that max_steps leave time for, by name, the best of its shortest episodes
     best_return:   the episode with the largest undiscounted return, the shortest if there are several
     best_per_step: the episode with the largest reward per step, the shortest if there are several
-    num_states:    number of states that play can reach (states in which the episode has ended not counted)
+    num_states:    number of states that play can reach (states in which the episode has ended not counted); None for a world
+                   that is too large to search: its episode was constructed and played, and there may be better ones
     """
 
     fewest: dict[str, Episode]
     best_return: Episode
     best_per_step: Episode
-    num_states: int
+    num_states: int | None
 
     def __str__(self):
         episodes = [("fewest steps", episode) for episode in self.fewest.values()]
         episodes += [("best return", self.best_return), ("best per step", self.best_per_step)]
         lines = [f"{'':15}{'outcome':15}{'steps':>5}{'return':>10}{'reward per step':>18}"]
         lines += [f"{what:15}{e.outcome:15}{e.steps:5}{e.total:10.4g}{e.per_step:18.4f}" for what, e in episodes]
-        return "\n".join([*lines, f"{self.num_states} states"])
+        return "\n".join([*lines, f"{self.num_states} states" if self.num_states else "constructed and played, not searched"])
 
 
 def find_optimum(world: World) -> Optimum:
     """The optimum of `world` within its max_steps; UsageError if it has more than MAX_STATES states.
 
-    Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions.
+    Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions. A world that says that it is not
+    searchable gives the episode of its own `plan` instead.
     """
+    if not world.searchable:
+        return played_plan(world)
     joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
     following, reward = compile_explore(world.step)(world.rules, world.start, joint, MAX_STATES)
     if len(following) > MAX_STATES:
@@ -74,6 +78,14 @@ def find_optimum(world: World) -> Optimum:
     possible = returns > -np.inf
     fewest = {names[k]: episode(possible[:, k].argmax(), k) for k in range(1, len(names)) if possible[:, k].any()}
     return Optimum(fewest, largest(returns), largest(per_step), len(following))
+
+
+def played_plan(world: World) -> Optimum:
+    """The episode of `world.plan()`, played by the world's rules; it lasts until the time limit."""
+    state, plan = world.start.copy(), world.plan()
+    total = sum(world.step(world.rules, state, actions)[0] for actions in plan)
+    episode = Episode("time limit", len(plan), total, float(reward_per_step(total, len(plan))))
+    return Optimum({}, episode, episode, None)
 
 
 @njit(cache=True)

@@ -39,7 +39,9 @@ class EpisodeLog:
         return np.array([np.bincount(trial).argmax() for trial in self.outcomes[:, episodes]])
 
     def share_at_best(self, episodes: slice) -> float:
-        """The share of trials whose usual outcome is the world's best one."""
+        """The share of trials whose usual outcome is the world's best one; nan if the world has no outcomes to be best."""
+        if not self.world.outcome_names:
+            return float("nan")
         return float(np.mean(self.usual_outcomes(episodes) == self.world.best_outcome))
 
     def summary(self, share: float = 0.05) -> str:

@@ -1,5 +1,7 @@
 """The worlds as a `gymnasium.vector.VectorEnv`: many copies of one world, advanced together by compiled rules."""
 
+from functools import partial
+
 import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -13,7 +15,8 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
     """`num_envs` independent copies of a world; all agents of a copy act at once and share its reward.
 
     reset(options={"reset_mask": bool [num_envs]}) resets the masked copies only; there is no automatic reset. A copy that has
-    ended stays still at reward 0 and keeps its flags until it is reset. Returned arrays are never written to again.
+    ended stays still at reward 0 and keeps its flags until it is reset. Returned arrays are never written to again; they are
+    parts of larger ones, so copy what is to be kept for long.
 
     reset -> obs, info; step(actions [num_envs, num_agents]) -> obs, reward, terminated, truncated, info with
         obs          float32 [num_envs, num_agents, obs_dim]
@@ -34,43 +37,52 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         self.single_action_space = gymnasium.spaces.MultiDiscrete([world.num_actions] * world.num_agents)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._advance, self._look = compile_batch(world.step, world.observe)
-        self._state = np.tile(world.start, (num_envs, 1))
-        self._clock = np.zeros(num_envs, np.int64)
-        self._outcome = np.zeros(num_envs, np.int64)
+        self._initial = np.array([0, 0, *world.start])  # outcome, number of steps, state
+        self._memory = np.tile(self._initial, (num_envs, 1))
+        look, advance = compile_batch(world.step, world.observe)
+        fixed = (world.rules, world.cell, world.local_index, world.state_scale, self._memory)
+        self._look = partial(look, *fixed)
+        self._advance = partial(advance, *fixed, world.num_actions, world.max_steps)
+        self._actions_shape = (num_envs, world.num_agents)
+        self._spare = iter(())
 
     def reset(self, *, seed=None, options=None):
-        """Start new episodes, in the copies of options["reset_mask"] or in all; the worlds are deterministic, whatever `seed`."""
+        """Start new episodes in the copies of options["reset_mask"] or in all; worlds are deterministic, whatever `seed`."""
         super().reset(seed=seed)
         mask = np.asarray(options["reset_mask"]) if options and "reset_mask" in options else np.ones(self.num_envs, bool)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"reset_mask must be booleans of shape {(self.num_envs,)}.")
-        self._state[mask] = self.world.start
-        self._clock[mask] = 0
-        self._outcome[mask] = 0
-        return self._see()
+        self._memory[mask] = self._initial
+        *_, outcome, obs, state, local_state = next(self._spare, None) or self._make_spare()
+        outcome[:] = self._memory[:, 0]
+        self._look(obs, state, local_state)
+        return obs, {"outcome": outcome, "state": state, "local_state": local_state}
 
     def step(self, actions):
         """One joint action (whole numbers [num_envs, num_agents]) in every copy; see the class for what comes back."""
-        world = self.world
         actions = np.asarray(actions)
-        if actions.shape != (self.num_envs, world.num_agents) or actions.dtype.kind not in "iu":
-            raise ValueError(f"actions must be whole numbers of shape {(self.num_envs, world.num_agents)}.")
-        reward = np.empty(self.num_envs)
-        flags = np.empty((2, self.num_envs), np.bool_)
-        self._advance(
-            world.rules, world.num_actions, world.max_steps, self._state, self._clock, self._outcome, actions, reward, flags
-        )
-        obs, info = self._see()
-        return obs, reward, flags[0], flags[1], info
+        if actions.shape != self._actions_shape or actions.dtype.kind not in "iu":
+            raise ValueError(f"actions must be whole numbers of shape {self._actions_shape}.")
+        results = next(self._spare, None) or self._make_spare()
+        if not self._advance(actions, *results):
+            raise ValueError(f"actions must be between 0 and {self.world.num_actions - 1}.")
+        reward, terminated, truncated, outcome, obs, state, local_state = results
+        return obs, reward, terminated, truncated, {"outcome": outcome, "state": state, "local_state": local_state}
 
-    def _see(self):
-        world = self.world
-        obs = np.empty((self.num_envs, world.num_agents, world.obs_dim), np.float32)
-        state = np.empty(self._state.shape, np.float32)
-        local_state = np.empty((self.num_envs, *world.local_index.shape), np.int64)
-        self._look(world.rules, world.cell, world.local_index, world.state_scale, self._state, obs, state, local_state)
-        return obs, {"outcome": self._outcome.copy(), "state": state, "local_state": local_state}
+    def _make_spare(self):
+        """Make fresh arrays for what the next steps return, for many at once, which is quicker; returns the first step's."""
+        world, steps = self.world, 1 + 1000 // self.num_envs
+        kinds = [
+            ((), np.float64),  # reward
+            ((), np.bool_),  # terminated
+            ((), np.bool_),  # truncated
+            ((), np.int64),  # outcome
+            ((world.num_agents, world.obs_dim), np.float32),  # obs
+            (world.start.shape, np.float32),  # state
+            (world.local_index.shape, np.int64),  # local_state
+        ]
+        self._spare = zip(*[np.empty((steps, self.num_envs, *shape), dtype) for shape, dtype in kinds], strict=True)
+        return next(self._spare)
 
     def render(self):
         """A tuple with one RGB picture [height, width, 3] (uint8) of every copy."""
@@ -78,4 +90,4 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
 
     def draw(self, index, caption=""):
         """An RGB picture [height, width, 3] (uint8) of one copy, with a line of text beneath."""
-        return draw(self.world, self._state[index], caption=caption)
+        return draw(self.world, self._memory[index, 2:], caption=caption)

@@ -124,7 +124,7 @@ def test_a_film_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
     path.write_bytes(b"old")
 
     def full_disk(self, file, *args, **options):
-        file.write_bytes(b"half")
+        file.write(b"half")
         raise OSError("no space left on device")
 
     monkeypatch.setattr(Image.Image, "save", full_disk)

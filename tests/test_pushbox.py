@@ -124,11 +124,11 @@ def test_the_default_room_has_only_the_lone_push_penalty():
         ((1, 0, S), (5, 0, N), "boundary"),
         ((1, 0, E), (2, 0, N), "teammate"),
         ((1, 0, E), (1, 0, E), "empty"),  # a teammate in one's own cell is not in front
-        ((0, 2, N), (0, 3, N), "small box"),  # a box hides the teammate in its cell
+        ((0, 2, N), (0, 3, N), "small box, teammate"),  # who stands in a box's cell is seen beside it
     ],
 )
 def test_agents_see_the_cell_in_front(agent, other, seen):
-    one_hot = [float(seen == what) for what in ("small box", "large box", "empty", "boundary", "teammate")]
+    one_hot = [float(what in seen) for what in ("small box", "large box", "empty", "boundary", "teammate")]
     assert look(LARGE, [*agent, *other, *BOXES_6])[0] == one_hot
     assert look(LARGE, [*other, *agent, *BOXES_6])[1] == one_hot
 

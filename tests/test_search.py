@@ -24,6 +24,11 @@ def summary(optimum):
         ("findtreasure", {"size": 9}, {"treasure": (12, 100), "meeting": (6, 3)}, ("treasure", 12, 100), 100 / 11),
         ("findtreasure", {"max_steps": 7}, {"meeting": (4, 3)}, ("meeting", 4, 3), 1),
         ("findtreasure", {"max_steps": 3}, {}, ("time limit", 3, 0), 0),
+        ("gotogether", {}, {"goal": (23, 9.5)}, ("goal", 23, 9.5), 9.5 / 22),
+        ("gotogether", {"size": 5}, {"goal": (3, 9.5)}, ("goal", 3, 9.5), 9.5 / 2),
+        ("gotogether", {"max_steps": 22}, {}, ("time limit", 22, 0), 0),
+        ("movebox", {}, {"far goal": (25, 100), "near goal": (12, 10)}, ("far goal", 25, 100), 100 / 24),
+        ("movebox", {"max_steps": 24}, {"near goal": (12, 10)}, ("near goal", 12, 10), 10 / 11),
         (
             "pushbox",
             {},

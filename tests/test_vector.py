@@ -140,7 +140,7 @@ def test_impossible_actions_are_refused(name, place):
 
 
 def test_impossible_environments_are_refused():
-    assert_refused("findtreasure, pushbox", envs.make_vec, "treasure")
+    assert_refused("cleaner, findtreasure, gotogether, movebox, pushbox", envs.make_vec, "treasure")
     assert_refused("at least 1", envs.make_vec, "pushbox", num_envs=0)
     assert_refused("option=value", envs.parse_options, ["size"])
 

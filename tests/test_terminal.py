@@ -1,0 +1,99 @@
+"""`python -m envs` and `python -m envs.gallery`: what they print and write, and how they refuse."""
+
+import io
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import envs
+from envs import __main__ as terminal
+from envs import gallery
+
+
+def run(module, monkeypatch, *words, typed=""):
+    """Call the program with these command-line words, and lines that are typed; returns its exit status."""
+    monkeypatch.setattr(sys, "argv", ["envs", *words])
+    monkeypatch.setattr(sys, "stdin", io.StringIO(typed))
+    try:
+        module.main()
+    except SystemExit as exit:
+        return exit.code
+    return 0
+
+
+def test_an_episode_by_the_keyboard(monkeypatch, capsys):
+    """The large box of pushbox, and a typing error on the way."""
+    assert run(terminal, monkeypatch, "pushbox", "--keys", typed="ff\nlr\nf\nFF \nff\nff\n") == 0
+    printed = capsys.readouterr().out
+    assert "f forward, l left, r right, w wait; a letter for each agent" in printed.replace("turn ", "")
+    assert "type 2 of the letters flrw and Enter, such as fl" in printed
+    assert "step 2: agent 0 turn left, agent 1 turn right; the team earned 0 (0 so far)" in printed
+    assert "|  0^1^  |\n+--------+\n0 1 agents, g goal, s small box, B large box\n" in printed
+    assert "agent 0 observes 0 0 1 0 0  [empty]\n" in printed
+    assert "agent 1 observes 0 1 0 0 0  [large box]\n" in printed
+    assert printed.endswith("end: large after 4 steps, return 100, 33.33 per step\n")
+
+
+def test_the_end_of_the_input_ends_the_episode(monkeypatch, capsys):
+    assert run(terminal, monkeypatch, "findtreasure", "--keys", typed="ud\n") == 0
+    assert capsys.readouterr().out.endswith("stopped after 1 step, return -0.2\n")
+
+
+@pytest.mark.parametrize("name", envs.WORLDS)
+def test_random_play(name, monkeypatch, capsys):
+    words = (name, "max_steps=5", "--delay", "0")
+    assert run(terminal, monkeypatch, *words) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("; the team earned ") == 5
+    assert printed.count("agent 1 observes ") == 6
+    assert "end: time limit after 5 steps" in printed
+    assert run(terminal, monkeypatch, *words, "--seed", "0") == 0
+    assert capsys.readouterr().out == printed
+    assert run(terminal, monkeypatch, *words, "--seed", "1") == 0
+    assert capsys.readouterr().out != printed
+
+
+def test_positions_are_told_in_cells(monkeypatch, capsys):
+    run(terminal, monkeypatch, "movebox", "--keys")
+    assert "agent 0 observes 0.867 0.0667 0.867 0.867 0.667 0.467  [(13, 1) (13, 13) (10, 7)]" in capsys.readouterr().out
+    run(terminal, monkeypatch, "movebox", "observation=own", "--keys")
+    assert "agent 1 observes 0.867 0.867  [(13, 13)]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("accepted", "words"),
+    [
+        ("cleaner, findtreasure, gotogether, movebox, pushbox", ["treasure"]),
+        ("4, 6, 8, 10", ["pushbox", "size=5"]),
+        ("option=value", ["pushbox", "size"]),
+        ("at least 0", ["pushbox", "--delay", "-1"]),
+        ("at least 0", ["pushbox", "--seed", "-1"]),
+    ],
+)
+def test_refused_words(accepted, words, monkeypatch, capsys):
+    assert run(terminal, monkeypatch, *words) == 2
+    out, error = capsys.readouterr()
+    assert out == ""
+    assert error.startswith("python -m envs: ")
+    assert accepted in error
+    assert error.count("\n") == 1
+
+
+def test_the_picture_of_all_worlds(monkeypatch, tmp_path):
+    assert run(gallery, monkeypatch, str(tmp_path / "docs" / "worlds.png")) == 0
+    with Image.open(tmp_path / "docs" / "worlds.png") as picture:
+        page = np.asarray(picture)
+    assert page.shape == (480, 2260, 3)
+    for k, name in enumerate(envs.WORLDS):
+        left = k * 460 + 210
+        assert len(np.unique(page[:420, left - 210 : left + 210].reshape(-1, 3), axis=0)) > 4, name  # a map
+        assert np.any(page[430:, left - 40 : left + 40] < 100), name  # its name
+    assert np.all(page[:, 425:455] == 255)  # space between two maps
+
+
+def test_a_picture_that_cannot_be_written(monkeypatch, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert run(gallery, monkeypatch, str(tmp_path / "file" / "worlds.png")) == 2
+    assert "cannot write" in capsys.readouterr().err
