@@ -35,7 +35,10 @@ import envs
 
 # Table 1 of the paper.
 WORLDS = {
+    "cleaner": dict(hidden=(256, 128), gamma=0.99, max_steps=200, num_episodes=20_000),
     "findtreasure": dict(hidden=(64,), gamma=0.98, max_steps=200, num_episodes=10_000),
+    "gotogether": dict(hidden=(64,), gamma=0.98, max_steps=2000, num_episodes=10_000),
+    "movebox": dict(hidden=(256, 128), gamma=0.999, max_steps=200, num_episodes=20_000),
     "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/decespg.md).
@@ -56,7 +59,7 @@ LIMITS = dict(
 @dataclass
 class Args:
     env: str = "pushbox"
-    """world: findtreasure or pushbox"""
+    """world: cleaner, findtreasure, gotogether, movebox or pushbox"""
     env_args: tuple[str, ...] = ()
     """options of the world, such as size=6 (envs/<world>.py lists them)"""
     seed: int = 1
@@ -204,6 +207,8 @@ def collect(env, policy, uniforms, rollout, frames=None):
     """
     num_agents = env.world.num_agents
     obs, _ = env.reset()
+    if frames is not None:
+        frames.append(env.draw(0, caption="start"))
     rollout.lengths[:] = 0
     running, playing, actor = np.ones(env.num_envs, bool), np.arange(env.num_envs), policy
     actions = np.zeros(rollout.actions.shape[1:], np.int64)
@@ -530,7 +535,7 @@ class Run:
             raise envs.UsageError(f"{args.run_dir} holds {state} run; {advice}start anew with --overwrite.")
         self._open_directory()
         trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
-        self.writers = [SummaryWriter(str(trial), purge_step=self.start, max_queue=1000) for trial in trials]
+        self.writers = [SummaryWriter(str(trial), purge_step=self.start + 1, max_queue=1000) for trial in trials]
 
     def _open_directory(self):
         directory, leftovers = self.args.run_dir, ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif", "seed*/events.*")
@@ -609,9 +614,10 @@ class Run:
                 writer.add_scalar(f"charts/{name}", value, done)
         for total in self.sums.values():
             total[:] = 0
-        best = f"{self.log.share_at_best(recent):.0%}"
-        score, speed = f"{curves['reward_per_step'].mean():.2f}", f"{steps.sum() / seconds:.0f}"
-        self.bar.set_postfix({"reward/step": score, "trials at best": best, "steps/s": speed}, refresh=False)
+        recently = {"reward/step": f"{curves['reward_per_step'].mean():.2f}", "steps/s": f"{steps.sum() / seconds:.0f}"}
+        if self.env.world.outcome_names:
+            recently["trials at best"] = f"{self.log.share_at_best(recent):.0%}"
+        self.bar.set_postfix(recently, refresh=False)
         self.clock = time.monotonic()
 
     def finish(self, policy):

@@ -97,20 +97,22 @@ def main(quick: bool = False):
     rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
     print_table("Million environment steps per second:", ["world", *(f"{n} copies" for n in copies)], rows)
 
-    rows, seconds = [], {}
+    rows, seconds, rates = [], {}, {}
     for method in METHODS:
         for env, episodes in EPISODES.items():
             episodes //= 10 if quick else 1
             one, one_rate = script_speed(method, env, 1, episodes)
             many, many_rate = script_speed(method, env, 20, episodes)
-            seconds[method, env] = many
+            seconds[method, env], rates[method, env] = many, many_rate
             rows.append([method, env, episodes, f"{one:.0f}", f"{one_rate:.0f}", f"{many:.0f}", f"{many_rate:.0f}"])
             rows[-1] += [f"{many_rate / one_rate:.1f}", f"{many / seconds['pg', env]:.2f}"]
     head = ["script", "world", "episodes", "1 trial: s", "steps/s", "20 trials: s", "steps/s", "20 : 1 trials", "time : pg"]
     print_table("Training, useful environment steps per second:", head, rows)
 
-    rows = [[m, f"{bonus_speed(m):.1f}"] for m in (50, 100, 200)]
-    print_table("The exploration bonus:", ["window m", "microseconds per visit"], rows)
+    visit = {m: bonus_speed(m) for m in (50, 100, 200)}
+    print_table("The exploration bonus:", ["window m", "microseconds per visit"], [[m, f"{visit[m]:.1f}"] for m in visit])
+    shares = [[env, f"{rates['decespg', env] * 2 * visit[50] / 1e6:.0%}"] for env in EPISODES]  # two agents remember each step
+    print_table("Its share of DecESPG's time at 20 trials:", ["world", "share"], shares)
     rows = [[method, f"{startup_seconds(method):.1f}"] for method in METHODS]
     print_table("Start-up, with two episodes:", ["script", "seconds"], rows)
 
