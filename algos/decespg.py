@@ -495,10 +495,16 @@ def resolve(args):
     values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
     options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
     envs.make_world(args.env, **options)
-    for name, (lowest, highest) in LIMITS.items():
-        for value in values[name] if isinstance(values[name], tuple) else [values[name]]:
-            envs.check_number(f"--{name.replace('_', '-')}", value, lowest, highest)
+    values["max_steps"] = options["max_steps"]
+    for name in LIMITS:
+        check_limits(name, values[name])
     return type(args)(**values), envs.make_vec(args.env, args.num_trials, **options)
+
+
+def check_limits(name, values):
+    """UsageError if an argument, or one of its numbers if it has several, is outside its LIMITS."""
+    for value in values if isinstance(values, tuple) else [values]:
+        envs.check_number(f"--{name.replace('_', '-')}", value, *LIMITS[name])
 
 
 def default_run_dir(args):
@@ -525,20 +531,22 @@ class Run:
         self.sums = {name: np.zeros(args.num_trials) for name in figures}  # since the last point of the curves
         arrays = [*arrays, self.log.returns, self.log.lengths, self.log.outcomes, *self.sums.values()]
         self.arrays = [torch.from_numpy(a) if isinstance(a, np.ndarray) else a.detach() for a in arrays]
-        self.settings = {name: value for name, value in asdict(args).items() if name not in HOUSEKEEPING}
+        self.settings = {"method": METHOD, **{k: v for k, v in asdict(args).items() if k not in HOUSEKEEPING}}
         self.checkpoint, self.result = args.run_dir / "checkpoint.pt", args.run_dir / "episodes.npz"
         self.start = 0
         if args.resume:
             self._load_checkpoint()
-        elif not args.overwrite and (self.result.exists() or self.checkpoint.exists()):
-            state, advice = ("a finished", "") if self.result.exists() else ("an unfinished", "go on with --resume or ")
-            raise envs.UsageError(f"{args.run_dir} holds {state} run; {advice}start anew with --overwrite.")
         self._open_directory()
         trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
         self.writers = [SummaryWriter(str(trial), purge_step=self.start + 1, max_queue=1000) for trial in trials]
 
     def _open_directory(self):
-        directory, leftovers = self.args.run_dir, ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif", "seed*/events.*")
+        directory, resume = self.args.run_dir, self.args.resume
+        kept = [directory / name for name in ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif")]
+        if not (resume or self.args.overwrite) and any(path.exists() for path in kept):
+            held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
+            advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
+            raise envs.UsageError(f"{directory} holds {held}; {advice}start anew with --overwrite.")
         about = {"method": METHOD, "args": asdict(self.args), "python": sys.version.split()[0]}
         about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
         git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
@@ -546,8 +554,8 @@ class Run:
             about["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            for old in [] if self.args.resume else [file for name in leftovers for file in directory.glob(name)]:
-                old.unlink()
+            for old in [] if resume else [*kept, *directory.glob("seed*/events.*")]:
+                old.unlink(missing_ok=True)
             with envs.complete_file(directory / "args.json") as file:
                 file.write(json.dumps(about, indent=2, default=str).encode())
         except OSError as error:
@@ -556,7 +564,10 @@ class Run:
     def _load_checkpoint(self):
         if not self.checkpoint.exists():
             raise envs.UsageError(f"there is nothing to resume: {self.args.run_dir} holds no checkpoint of an unfinished run.")
-        saved = torch.load(self.checkpoint, weights_only=True)
+        try:
+            saved = torch.load(self.checkpoint, weights_only=True)
+        except Exception as error:  # whatever can be wrong with a file
+            raise envs.UsageError(f"{self.checkpoint} cannot be read; start anew with --overwrite.") from error
         for name, value in self.settings.items():
             if (kept := saved["settings"].get(name)) != value:
                 raise envs.UsageError(f"--resume needs the same arguments, but {name} was {kept} and is now {value}.")
@@ -654,6 +665,12 @@ def play(env, policy, args, num_episodes, video):
 
 def evaluate(args):
     """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
+    torch.set_num_threads(1)
+    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
+    check_limits("num_episodes", num_episodes)
+    check_limits("seed", args.seed)
+    if not args.evaluate.exists():
+        raise envs.UsageError(f"there is no file {args.evaluate}.")
     try:
         saved = torch.load(args.evaluate, weights_only=True)
         world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
@@ -664,7 +681,6 @@ def evaluate(args):
             param.data.copy_(kept)
     except Exception as error:  # whatever can be wrong with a file
         raise envs.UsageError(f"{args.evaluate} is not a policy.pt that --save-model wrote.") from error
-    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
     log = play(envs.GridVectorEnv(world, teams), policy, args, num_episodes, video)
     print(f"{args.evaluate}: {num_episodes} episodes of {teams} teams, {log.summary(share=1.0)}; one of them in {video}")
 
