@@ -34,6 +34,8 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 
+sys.modules.setdefault(Path(__file__).stem, sys.modules[__name__])  # where numba's cache looks after an import by this name
+
 # Table 1 of the paper.
 WORLDS = {
     "cleaner": dict(hidden=(256, 128), gamma=0.99, max_steps=200, num_episodes=20_000),
@@ -44,8 +46,14 @@ WORLDS = {
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/pg.md).
 TUNED = {
+    ("cleaner", "sign"): dict(learning_rate=3e-4),
+    ("cleaner", "adam"): dict(learning_rate=1e-3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3),
     ("findtreasure", "adam"): dict(learning_rate=3e-3),
+    ("gotogether", "sign"): dict(learning_rate=1e-3),
+    ("gotogether", "adam"): dict(learning_rate=3e-3),
+    ("movebox", "sign"): dict(learning_rate=3e-4),
+    ("movebox", "adam"): dict(learning_rate=1e-3),
     ("pushbox", "sign"): dict(learning_rate=3e-4),
     ("pushbox", "adam"): dict(learning_rate=1e-3),
 }
@@ -141,18 +149,19 @@ class StackedOptimizer:
     @torch.no_grad()
     def step(self, grads, active=None):
         """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        rate = self.learning_rate if active is None else self.learning_rate * active.view(-1, 1, 1).float()
+        mask = 1.0 if active is None else active.view(-1, 1, 1).float()
         if self.kind == "sign":
             for param, grad in zip(self.params, grads, strict=True):
-                param -= rate * (grad / grad.abs().add_(1e-8))
+                step = grad if active is None else grad * mask
+                param.addcdiv_(step, grad.abs().add_(1e-8), value=-self.learning_rate)
             return
-        kept = 0.0 if active is None else 1.0 - active.view(-1, 1, 1).float()
-        self.count += 1.0 - kept
+        self.count += mask
         correction1, correction2 = (1 - decay ** self.count.clamp(min=1) for decay in (0.9, 0.999))
         for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
-            first += 0.1 * (1.0 - kept) * (grad - first)
-            second += 0.001 * (1.0 - kept) * (grad * grad - second)
-            param -= rate * (first / correction1 / (second / correction2).sqrt_().add_(1e-8))
+            first += (0.1 * mask) * (grad - first)
+            second += (0.001 * mask) * (grad * grad - second)
+            step = first / correction1 * mask
+            param.addcdiv_(step, (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
 
 
 @njit(cache=True)
@@ -200,11 +209,11 @@ def collect(env, policy, uniforms, rollout, frames=None):
     if frames is not None:
         frames.append(env.draw(0, caption="start"))
     rollout.lengths[:] = 0
-    running, playing, actor = np.ones(env.num_envs, bool), np.arange(env.num_envs), policy
+    running, playing, num_playing, actor = np.ones(env.num_envs, bool), slice(None), env.num_envs, policy
     actions = np.zeros(rollout.actions.shape[1:], np.int64)
     for t in range(env.world.max_steps):
-        logits = actor(torch.from_numpy(obs[playing]).view(len(playing) * num_agents, 1, -1)).numpy()
-        logits = logits.reshape(len(playing), num_agents, -1)
+        logits = actor(torch.from_numpy(obs[playing]).view(num_playing * num_agents, 1, -1))
+        logits = logits.view(num_playing, num_agents, -1).numpy()
         actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
         rollout.obs[t], rollout.actions[t] = obs, actions
         rollout.lengths += running
@@ -215,8 +224,8 @@ def collect(env, policy, uniforms, rollout, frames=None):
         num_running = np.count_nonzero(running)
         if num_running == 0:
             break
-        if 2 * num_running <= len(playing):  # acting takes as long as there are networks: let those that wait go
-            playing = np.flatnonzero(running)
+        if 2 * num_running <= num_playing:  # acting takes as long as there are networks: let those that wait go
+            playing, num_playing = np.flatnonzero(running), num_running
             actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
     rollout.outcomes[:] = info["outcome"]
 

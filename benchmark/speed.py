@@ -5,8 +5,10 @@
 Prints tables of figures and of their ratios, all from this one run; run it on an otherwise idle machine.
 """
 
+import contextlib
 import dataclasses
 import importlib
+import io
 import subprocess
 import sys
 import tempfile
@@ -17,7 +19,7 @@ import numpy as np
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "algos")]
+sys.path.insert(0, str(ROOT))
 import envs
 
 METHODS = ("pg", "decespg")
@@ -49,8 +51,8 @@ def world_speed(name, num_envs, seconds=1.0):
 
 def script_speed(method, env, num_trials, num_episodes):
     """Seconds of a training run and its useful steps (of trials whose episode still runs) per second."""
-    script = importlib.import_module(method)
-    with tempfile.TemporaryDirectory() as folder:
+    script = importlib.import_module(f"algos.{method}")
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up")
         script.train(args)
         args = dataclasses.replace(args, num_episodes=num_episodes, run_dir=Path(folder) / "run")
@@ -62,7 +64,7 @@ def script_speed(method, env, num_trials, num_episodes):
 
 def bonus_speed(window, visits=20_000):
     """Microseconds per remembered visit of DecESPG's Gaussian process, along random play in findtreasure."""
-    script, env = importlib.import_module("decespg"), envs.make_vec("findtreasure")
+    script, env = importlib.import_module("algos.decespg"), envs.make_vec("findtreasure")
     world, rng = env.world, np.random.default_rng(0)
     obs = np.zeros((visits, 1, world.num_agents, world.obs_dim), np.float32)
     actions = rng.integers(0, world.num_actions, (visits, 1, world.num_agents))
@@ -95,7 +97,7 @@ def main(quick: bool = False):
     """
     copies = (1, 20, 200)
     rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
-    print_table("Million environment steps per second:", ["world", *(f"{n} copies" for n in copies)], rows)
+    print_table("Million environment steps per second:", ["world", *(f"{n} cop{'y' if n == 1 else 'ies'}" for n in copies)], rows)
 
     rows, seconds, rates = [], {}, {}
     for method in METHODS:

@@ -210,11 +210,34 @@ def test_the_default_directory_says_what_is_not_default(name):
 
 
 @each_script
+def test_every_world_and_optimiser_has_its_defaults(name):
+    module = script(name)
+    for world in envs.WORLDS:
+        for optimizer in ("sign", "adam"):
+            resolved, env = module.resolve(module.Args(env=world, optimizer=optimizer, num_trials=2))
+            assert env.world.name == world
+            assert env.num_envs == 2
+            assert all(getattr(resolved, argument) is not None for argument in module.LIMITS)
+            assert resolved.hidden == module.WORLDS[world]["hidden"]
+            assert resolved.learning_rate == module.TUNED[world, optimizer]["learning_rate"]
+
+
+@each_script
 def test_a_script_runs_from_anywhere(name, tmp_path):
     words = [sys.executable, ALGOS / f"{name}.py", "--env", "pushbox", "--num-episodes", "3", "--max-steps", "5"]
     ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert (ended.returncode, ended.stdout.count("\n")) == (0, 1)
     assert results(tmp_path / "runs/pushbox" / name / "seed1-num_episodes=3-max_steps=5")["returns"].shape == (1, 3)
+
+
+@each_script
+def test_compiled_functions_are_found_whatever_name_a_script_was_imported_by(name, tmp_path):
+    call = "print(m.discounted_returns(np.ones((2, 1, 1)), np.array([2]), 0.5).sum())"
+    for module, folder in ((name, ALGOS), (f"algos.{name}", ALGOS.parent)):
+        code = f"import numpy as np, {module} as m; {call}"
+        environment = {**os.environ, "PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(tmp_path)}
+        ended = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert (ended.returncode, ended.stdout) == (0, "2.5\n"), ended.stderr
 
 
 # --- a finished run ---
@@ -276,6 +299,14 @@ def test_args_json_holds_all_resolved_arguments_and_versions(finished):
     assert [name for name, value in about["args"].items() if value is None] == ["evaluate"]
     assert about["torch"] == version("torch")
     assert {"python", "numpy", "numba", "gymnasium", "commit"} <= about.keys()
+
+
+@each_script
+def test_a_time_limit_among_the_options_of_the_world_counts(name, tmp_path):
+    words = ["--env-args", "max_steps=7", "--max-steps", "9", "--num-episodes", "2", "--run-dir", tmp_path]
+    assert command(name, *words).code == 0
+    assert json.loads((tmp_path / "args.json").read_text())["args"]["max_steps"] == 7
+    assert results(tmp_path)["lengths"].max() <= 7
 
 
 def test_the_episodes_agree_with_each_other(finished):
@@ -497,6 +528,31 @@ def test_resume_refuses_changed_arguments_by_name(interrupted, changed, what):
     ended = command(stopped.name, *INTERRUPTED, "--run-dir", stopped.directory, "--resume", *changed)
     assert_refusal(stopped.name, ended, f"but {what} was ")
     assert contents(stopped.directory) == before
+
+
+def test_a_checkpoint_of_another_script_is_refused(interrupted):
+    stopped, _ = interrupted
+    other = next(name for name in SCRIPTS if name != stopped.name)
+    ended = command(other, *INTERRUPTED, "--run-dir", stopped.directory, "--resume")
+    assert_refusal(other, ended, f"method was {stopped.name} and is now {other}")
+
+
+def test_a_broken_checkpoint_is_refused_and_kept(interrupted, tmp_path):
+    stopped, _ = interrupted
+    shutil.copytree(stopped.directory, tmp_path / "run")
+    broken = tmp_path / "run" / "checkpoint.pt"
+    broken.write_bytes(broken.read_bytes()[:1000])
+    ended = command(stopped.name, *INTERRUPTED, "--run-dir", tmp_path / "run", "--resume")
+    assert_refusal(stopped.name, ended, "checkpoint.pt cannot be read")
+    assert len(broken.read_bytes()) == 1000
+
+
+@each_script
+def test_a_policy_without_its_run_is_not_cleared_away(name, tmp_path):
+    (tmp_path / "policy.pt").write_bytes(b"somebody's")
+    ended = command(name, *INTERRUPTED, "--run-dir", tmp_path)
+    assert_refusal(name, ended, "holds an unfinished run or a part of one", "--overwrite")
+    assert contents(tmp_path) == {Path("policy.pt"): b"somebody's"}
 
 
 @pytest.mark.parametrize(("name", "optimizer"), [("pg", "sign"), ("decespg", "sign"), ("decespg", "adam")])
