@@ -21,6 +21,7 @@ settings.register_profile("compiled", deadline=None)  # the first example of a t
 settings.load_profile("compiled")
 ALGOS = Path(__file__).resolve().parents[1] / "algos"
 SCRIPTS = sorted(path.stem for path in ALGOS.glob("*.py"))
+each_script = pytest.mark.parametrize("name", SCRIPTS)
 each_setting = pytest.mark.parametrize(
     ("env", "optimizer"), list(itertools.product(("findtreasure", "pushbox"), ("sign", "adam")))
 )

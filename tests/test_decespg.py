@@ -11,13 +11,11 @@ from algos import decespg, pg
 from tests.helpers import (
     assert_same_direction,
     assert_same_run,
-    assert_trials_are_runs,
     curves,
     each_setting,
     plain_returns,
     record_updates,
     train,
-    use_double_precision,
 )
 
 # --- the exploration bonus ---
@@ -350,22 +348,6 @@ def test_without_bonus_and_memory_it_is_pg_bit_for_bit(env, optimizer, tmp_path)
     args = dict(env=env, optimizer=optimizer, seed=5, num_trials=2, num_episodes=150, learning_rate=1e-3)
     plain, bare = train(pg, tmp_path / "pg", **args), train(decespg, tmp_path / "decespg", **args, beta=0.0, slots=0)
     assert_same_run(plain, bare)
-
-
-@each_setting
-def test_trials_are_runs(env, optimizer, tmp_path, monkeypatch):
-    use_double_precision(decespg, monkeypatch)
-    assert_trials_are_runs(decespg, tmp_path, 1e-9, env=env, optimizer=optimizer)
-
-
-def test_trials_are_runs_in_single_precision(tmp_path):
-    assert_trials_are_runs(decespg, tmp_path, 1e-5, env="pushbox")
-
-
-@each_setting
-def test_the_same_command_gives_the_same_run(env, optimizer, tmp_path):
-    args = dict(env=env, optimizer=optimizer, num_trials=2, num_episodes=100)
-    assert_same_run(*(train(decespg, tmp_path / which, **args) for which in ("first", "second")))
 
 
 def test_decespg_pushes_the_large_box_together(tmp_path):

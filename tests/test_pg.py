@@ -11,14 +11,10 @@ from algos import pg
 from tests.helpers import (
     SCRIPTS,
     assert_same_direction,
-    assert_same_run,
-    assert_trials_are_runs,
-    each_setting,
     plain_returns,
     record_updates,
     script,
     train,
-    use_double_precision,
     weights,
 )
 
@@ -269,22 +265,6 @@ def test_networks_outside_the_mask_stay_untouched(kind):
 
 
 # --- whole runs ---
-
-
-@each_setting
-def test_trials_are_runs(env, optimizer, tmp_path, monkeypatch):
-    use_double_precision(pg, monkeypatch)
-    assert_trials_are_runs(pg, tmp_path, 1e-9, env=env, optimizer=optimizer)
-
-
-def test_trials_are_runs_in_single_precision(tmp_path):
-    assert_trials_are_runs(pg, tmp_path, 1e-5, env="pushbox")
-
-
-@each_setting
-def test_the_same_command_gives_the_same_run(env, optimizer, tmp_path):
-    args = dict(env=env, optimizer=optimizer, num_trials=2, num_episodes=100)
-    assert_same_run(*(train(pg, tmp_path / which, **args) for which in ("first", "second")))
 
 
 def test_pg_ends_in_the_local_optimum_of_findtreasure(tmp_path):

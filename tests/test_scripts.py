@@ -24,9 +24,8 @@ import torch
 from PIL import Image
 
 import envs
-from tests.helpers import ALGOS, SCRIPTS, assert_one_sentence, curves, script
+from tests.helpers import ALGOS, SCRIPTS, assert_one_sentence, curves, each_script, script
 
-each_script = pytest.mark.parametrize("name", SCRIPTS)
 SOURCES = {f"{name}.py": (ALGOS / f"{name}.py").read_text() for name in SCRIPTS}
 
 
