@@ -100,6 +100,35 @@ def observe_own(rules, cell, state, obs):
         obs[i, 1] = state[2 * i + 1] * cell
 
 
+class PositionWorld(World):
+    """A world whose state begins with each agent's row and column, which is what agents observe: those of all or one's own."""
+
+    def __init__(self, rules, start, size, num_agents, observation, max_steps, objects=()):
+        """As World, but for
+        size:        of the map; positions are divided by it
+        observation: "positions" or "own"
+        objects:     entries of the state, next to the agents' positions, that are rows and columns of things they may observe
+        """
+        check_choice("observation", observation, ("positions", "own"))
+        everything = observation == "positions"
+        self.observe = observe_positions if everything else observe_own
+        self.size, positions = size, 2 * num_agents + len(objects)
+        super().__init__(
+            rules=rules,
+            start=start,
+            local_index=[[2 * i, 2 * i + 1, *objects] for i in range(num_agents)],
+            num_agents=num_agents,
+            obs_dim=positions if everything else 2,
+            cell=1 / size,
+            state_scale=[1 / size] * positions + [1] * (len(start) - positions),
+            max_steps=max_steps,
+        )
+
+    def sketch_agents(self, state):
+        """The shapes of the agents, see `envs.drawing`."""
+        return [("agent", i, state[2 * i], state[2 * i + 1], None) for i in range(self.num_agents)]
+
+
 @cache
 def compile_batch(step, observe):
     """The compiled functions `advance` and `look` for a whole batch of worlds with these rules.

@@ -31,7 +31,7 @@ Source        the published env_Cleaner, whose maze is drawn at random; the one 
 import numpy as np
 from numba import njit
 
-from envs.base import UsageError, World, check_choice, check_whole, observe_own, observe_positions
+from envs.base import PositionWorld, UsageError, check_whole
 
 MAZE = (
     *("#############", "#...#.......#", "#.#.###.###.#", "#.#.#...#...#", "###.###.#.###", "#.......#...#", "#.#.#.#######"),
@@ -60,7 +60,7 @@ def step(places, state, actions):
     return reward, 0
 
 
-class Cleaner(World):
+class Cleaner(PositionWorld):
     """Cleaner; see the module's docstring."""
 
     name = "cleaner"
@@ -82,25 +82,14 @@ class Cleaner(World):
         if size % 2 == 0:
             raise UsageError(f"cleaner's size must be odd (the maze's rooms lie at odd rows and columns), not {size}.")
         check_whole("num_agents", num_agents, minimum=1)
-        check_choice("observation", observation, ("positions", "own"))
         if maze_seed is None and size == len(MAZE):
             free = np.array([[cell == "." for cell in row] for row in MAZE])
         else:
             free = random_maze(size, 0 if maze_seed is None else check_whole("maze_seed", maze_seed, minimum=0))
-        self.observe = observe_positions if observation == "positions" else observe_own
-        self.size, num_cells = size, int(free.sum())
+        num_cells = int(free.sum())
         places = np.full((size, size), WALL, np.int16)
         places[free] = 2 * num_agents + np.arange(num_cells)
-        super().__init__(
-            rules=places,
-            start=[1, 1] * num_agents + [1] * num_cells,
-            local_index=np.arange(2 * num_agents).reshape(num_agents, 2),
-            num_agents=num_agents,
-            obs_dim=2 * num_agents if observation == "positions" else 2,
-            cell=1 / size,
-            state_scale=[1 / size] * (2 * num_agents) + [1] * num_cells,
-            max_steps=max_steps,
-        )
+        super().__init__(places, [1, 1] * num_agents + [1] * num_cells, size, num_agents, observation, max_steps)
 
     def plan(self):
         """Joint actions [max_steps, num_agents] of a good team: all go to the nearest dirty cell that nobody else takes.
@@ -137,8 +126,7 @@ class Cleaner(World):
     def sketch(self, state):
         shapes = [("cell", "wall", r, c) for r, c in np.argwhere(self.rules == WALL)]
         shapes += [("cell", "dirt", r, c) for r, c in np.argwhere(self.rules != WALL) if state[self.rules[r, c]]]
-        shapes += [("agent", i, state[2 * i], state[2 * i + 1], None) for i in range(self.num_agents)]
-        return self.size, self.size, shapes
+        return self.size, self.size, shapes + self.sketch_agents(state)
 
 
 def random_maze(size, seed):

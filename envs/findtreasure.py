@@ -25,7 +25,7 @@ Source        the map, the rules and the bump's cost are the authors' published 
 import numpy as np
 from numba import njit
 
-from envs.base import UsageError, World, check_choice, check_whole, observe_own, observe_positions
+from envs.base import PositionWorld, UsageError, check_whole
 
 UP, DOWN, LEFT, RIGHT, WAIT = range(5)
 FREE, WALL, DOOR, LEVER, MEETING, TREASURE = range(6)
@@ -58,7 +58,7 @@ def step(grid, state, actions):
     return reward, 0
 
 
-class FindTreasure(World):
+class FindTreasure(PositionWorld):
     """FindTreasure; see the module's docstring."""
 
     name = "findtreasure"
@@ -71,29 +71,17 @@ class FindTreasure(World):
         check_whole("size", size, minimum=7)
         if size % 2 == 0:
             raise UsageError(f"findtreasure's size must be odd (the wall has a middle cell), not {size}.")
-        check_choice("observation", observation, ("positions", "own"))
-        self.observe = observe_positions if observation == "positions" else observe_own
-        self.size, middle, last = size, size // 2, size - 2
+        middle, last = size // 2, size - 2
         grid = np.full((size, size), WALL, np.int8)
         grid[1:middle, 1:-1] = FREE
         grid[middle + 1 : -1, 1:-1] = FREE
         grid[middle, middle - 1 : middle + 2] = DOOR
         grid[last, last], grid[last - 1, last], grid[1, last] = LEVER, MEETING, TREASURE
-        super().__init__(
-            rules=grid,
-            start=[last - 1, 1, last, 1],
-            local_index=[[0, 1], [2, 3]],
-            num_agents=2,
-            obs_dim=4 if observation == "positions" else 2,
-            cell=1 / size,
-            state_scale=[1 / size] * 4,
-            max_steps=max_steps,
-        )
+        super().__init__(grid, [last - 1, 1, last, 1], size, num_agents=2, observation=observation, max_steps=max_steps)
 
     def sketch(self, state):
         grid = self.rules
         door_open = LEVER in (grid[state[0], state[1]], grid[state[2], state[3]])
         kinds = (None, "wall", "open door" if door_open else "door", "lever", "meeting", "treasure")  # as numbered above
         shapes = [("cell", kinds[grid[r, c]], r, c) for r, c in np.argwhere(grid != FREE)]
-        shapes += [("agent", i, state[2 * i], state[2 * i + 1], None) for i in range(2)]
-        return self.size, self.size, shapes
+        return self.size, self.size, shapes + self.sketch_agents(state)

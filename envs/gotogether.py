@@ -24,7 +24,7 @@ Source        the map and the rules are the authors' published env_GoTogether; r
 import numpy as np
 from numba import njit
 
-from envs.base import World, check_choice, check_whole, observe_own, observe_positions
+from envs.base import PositionWorld, check_whole
 
 FREE, WALL, GOAL = range(3)
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -48,7 +48,7 @@ def step(grid, state, actions):
     return reward, 0
 
 
-class GoTogether(World):
+class GoTogether(PositionWorld):
     """GoTogether; see the module's docstring."""
 
     name = "gotogether"
@@ -58,25 +58,13 @@ class GoTogether(World):
     step = staticmethod(step)
 
     def __init__(self, size: int = 15, observation: str = "positions", max_steps: int = 2000):
-        self.size = check_whole("size", size, minimum=5)
-        check_choice("observation", observation, ("positions", "own"))
-        self.observe = observe_positions if observation == "positions" else observe_own
+        check_whole("size", size, minimum=5)
         grid = np.full((size, size), WALL, np.int8)
         grid[1:-1, 1:-1] = FREE
         grid[1, size - 2] = GOAL
-        super().__init__(
-            rules=grid,
-            start=[size - 3, 1, size - 2, 2],
-            local_index=[[0, 1], [2, 3]],
-            num_agents=2,
-            obs_dim=4 if observation == "positions" else 2,
-            cell=1 / size,
-            state_scale=[1 / size] * 4,
-            max_steps=max_steps,
-        )
+        super().__init__(grid, [size - 3, 1, size - 2, 2], size, num_agents=2, observation=observation, max_steps=max_steps)
 
     def sketch(self, state):
         kinds = (None, "wall", "goal")  # as numbered above
         shapes = [("cell", kinds[self.rules[r, c]], r, c) for r, c in np.argwhere(self.rules != FREE)]
-        shapes += [("agent", i, state[2 * i], state[2 * i + 1], None) for i in range(2)]
-        return self.size, self.size, shapes
+        return self.size, self.size, shapes + self.sketch_agents(state)

@@ -33,7 +33,7 @@ Source        the map and the rules are the authors' published env_MoveBox; rewa
 import numpy as np
 from numba import njit
 
-from envs.base import World, check_choice, observe_own, observe_positions
+from envs.base import PositionWorld
 
 MAP = (
     *("###############", "######fff######"),
@@ -92,7 +92,7 @@ def step(grid, state, actions):
     return 0.0, 0
 
 
-class MoveBox(World):
+class MoveBox(PositionWorld):
     """MoveBox; see the module's docstring."""
 
     name = "movebox"
@@ -102,23 +102,12 @@ class MoveBox(World):
     step = staticmethod(step)
 
     def __init__(self, observation: str = "positions", max_steps: int = 200):
-        check_choice("observation", observation, ("positions", "own"))
-        self.observe = observe_positions if observation == "positions" else observe_own
-        size = len(MAP)
-        super().__init__(
-            rules=np.array([[".#fn".index(cell) for cell in row] for row in MAP], np.int8),
-            start=[13, 1, 13, 13, 10, 7],
-            local_index=[[0, 1, BOX_ROW, BOX_COLUMN], [2, 3, BOX_ROW, BOX_COLUMN]],
-            num_agents=2,
-            obs_dim=6 if observation == "positions" else 2,
-            cell=1 / size,
-            state_scale=[1 / size] * 6,
-            max_steps=max_steps,
-        )
+        grid = np.array([[".#fn".index(cell) for cell in row] for row in MAP], np.int8)
+        start, box = [13, 1, 13, 13, 10, 7], (BOX_ROW, BOX_COLUMN)
+        super().__init__(grid, start, len(MAP), num_agents=2, observation=observation, max_steps=max_steps, objects=box)
 
     def sketch(self, state):
         kinds = (None, "wall", "far goal", "near goal")  # as numbered above
         shapes = [("cell", kinds[self.rules[r, c]], r, c) for r, c in np.argwhere(self.rules != FREE)]
         shapes.append(("box", "box", state[BOX_ROW], state[BOX_COLUMN], 1))
-        shapes += [("agent", i, state[2 * i], state[2 * i + 1], None) for i in range(2)]
-        return *self.rules.shape, shapes
+        return self.size, self.size, shapes + self.sketch_agents(state)
