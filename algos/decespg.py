@@ -144,6 +144,9 @@ class StackedMLP:
         return part
 
 
+Policy = StackedMLP  # what agents act with: observations to logits of the actions
+
+
 class StackedOptimizer:
     """Gradient descent for stacked networks, every network on its own.
 
@@ -197,11 +200,14 @@ def sample_actions(logits, uniforms):
 
 
 class Rollout:
-    """One episode of every trial, time first; a row beyond a trial's length counts for nothing."""
+    """One episode of every trial, time first; a row beyond a trial's length counts for nothing.
+
+    Only `obs` has one row more, for what was seen after the last step (critics ask for it where the time limit cuts).
+    """
 
     def __init__(self, env):
         world, shape = env.world, (env.world.max_steps, env.num_envs)
-        self.obs = np.zeros((*shape, world.num_agents, world.obs_dim), np.float32)
+        self.obs = np.zeros((world.max_steps + 1, env.num_envs, world.num_agents, world.obs_dim), np.float32)
         self.actions = np.zeros((*shape, world.num_agents), np.int64)
         self.reward = np.zeros(shape)
         self.lengths = np.zeros(env.num_envs, np.int64)
@@ -216,19 +222,19 @@ def collect(env, policy, uniforms, rollout, frames=None):
     Pictures of the first world are appended to `frames` if it is a list.
     """
     num_agents = env.world.num_agents
-    obs, _ = env.reset()
+    rollout.obs[0], _ = env.reset()
     if frames is not None:
         frames.append(env.draw(0, caption="start"))
     rollout.lengths[:] = 0
     running, playing, num_playing, actor = np.ones(env.num_envs, bool), slice(None), env.num_envs, policy
     actions = np.zeros(rollout.actions.shape[1:], np.int64)
     for t in range(env.world.max_steps):
-        logits = actor(torch.from_numpy(obs[playing]).view(num_playing * num_agents, 1, -1))
+        logits = actor(torch.from_numpy(rollout.obs[t][playing]).view(num_playing * num_agents, 1, -1))
         logits = logits.view(num_playing, num_agents, -1).numpy()
         actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
-        rollout.obs[t], rollout.actions[t] = obs, actions
+        rollout.actions[t] = actions
         rollout.lengths += running
-        obs, rollout.reward[t], terminated, truncated, info = env.step(actions)
+        rollout.obs[t + 1], rollout.reward[t], terminated, truncated, info = env.step(actions)
         if frames is not None and running[0]:
             frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
         running = ~(terminated | truncated)
@@ -454,7 +460,7 @@ def train(args: Args):
     seeds = [np.random.SeedSequence(args.seed + k).spawn(3) for k in range(args.num_trials)]
     init, act, _ = [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
 
-    policy = StackedMLP(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
+    policy = Policy(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
     optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
     novelty = VisitNovelty(args.num_trials, num_agents, world.obs_dim, args.window, args.sigma * world.cell, args.noise)
     memory = SelectiveMemory(env, args.slots)
@@ -501,7 +507,8 @@ HOUSEKEEPING = ("run_dir", "checkpoint_every", "resume", "overwrite", "save_mode
 
 def resolve(args):
     """The arguments with every None filled in from WORLDS and TUNED, and the worlds; UsageError for what is impossible."""
-    defaults = {**WORLDS.get(args.env, {}), **TUNED.get((args.env, args.optimizer), {}), "run_dir": default_run_dir(args)}
+    tuned = TUNED.get((args.env, getattr(args, "optimizer", "adam")), {})  # Q-learning has no policies, and Adam always
+    defaults = {**WORLDS.get(args.env, {}), **tuned, "run_dir": default_run_dir(args)}
     values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
     options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
     envs.make_world(args.env, **options)
@@ -686,7 +693,7 @@ def evaluate(args):
         world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
         teams = len(saved["params"][0]) // world.num_agents
         sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
-        policy = StackedMLP([np.random.default_rng(0)] * teams, world.num_agents, sizes)
+        policy = Policy([np.random.default_rng(0)] * teams, world.num_agents, sizes)
         for param, kept in zip(policy.params, saved["params"], strict=True):
             param.data.copy_(kept)
     except Exception as error:  # whatever can be wrong with a file

@@ -193,15 +193,19 @@ def assert_same_direction(direction, params, steps_of):
 def use_double_precision(module, monkeypatch):
     """Let the networks of a script calculate in double precision, in which rounding does not grow into sight."""
 
-    class DoubleMLP(module.StackedMLP):
-        def __init__(self, *args):
-            super().__init__(*args)
-            self.params = [param.detach().double().requires_grad_() for param in self.params]
+    def doubled(network):
+        class DoubleMLP(network):
+            def __init__(self, *args):
+                super().__init__(*args)
+                self.params = [param.detach().double().requires_grad_() for param in self.params]
 
-        def __call__(self, x):
-            return super().__call__(x.double())
+            def __call__(self, x):
+                return super().__call__(x.double())
 
-    monkeypatch.setattr(module, "StackedMLP", DoubleMLP)
+        return DoubleMLP
+
+    for name in ("StackedMLP", "Policy"):
+        monkeypatch.setattr(module, name, doubled(getattr(module, name)))
 
 
 def assert_same_episodes(some, others):

@@ -133,7 +133,7 @@ def test_shared_limits_are_the_same():
 @pytest.mark.parametrize(
     ("old", "new", "what", "starts"),
     [
-        ("obs, _ = env.reset()", "obs = env.reset()[0]", "collect", "@torch.no_grad()\ndef collect"),
+        ("rollout.obs[0], _ = env.reset()", "rollout.obs[0] = env.reset()[0]", "collect", "@torch.no_grad()\ndef collect"),
         ("@njit(cache=True)\ndef merge_steps", "@njit\ndef merge_steps", "merge_steps", "@njit\ndef merge_steps"),
         ("        x = torch.baddbmm", "        # a comment\n        x = torch.baddbmm", "StackedMLP", "class StackedMLP"),
         ("    seed: int = 1\n", "    seed: int = 2\n", "Args.seed", "    seed: int"),
@@ -156,7 +156,7 @@ def test_a_changed_copy_is_found_with_both_places(old, new, what, starts):
 
 def test_a_change_that_names_the_other_script_is_excused():
     original = SOURCES["pg.py"]
-    changed = original.replace("    obs, _ = env.reset()", "    obs = env.reset()[0]")
+    changed = original.replace("    rollout.obs[0], _ = env.reset()", "    rollout.obs[0] = env.reset()[0]")
     told = changed.replace(
         '"""Play one episode in every world,', '"""Differs from pg.py by one line. Play one episode in every world,'
     )
