@@ -2,13 +2,18 @@
 
 Each cell of the grid trains 5 teams (seeds 1000-1004, which no reported result uses) for a quarter of Table 1's episodes. The
 best cell has the highest mean reward per step over the last 5 % of the episodes; of equal ones, the higher mean over all. The
-paper's figures play no part. Finished cells are not run again, interrupted ones go on.
+paper's figures play no part.
 
-    python benchmark/tune.py pg decespg --jobs 2         # writes benchmark/tuning/pg.md and decespg.md
+    python benchmark/tune.py pg decespg --jobs 2         # adds what is missing in benchmark/tuning/pg.csv and decespg.csv
+
+The tables hold what was measured and are all that the rule reads: a cell with a row there is not run again (after a change of
+a method, delete its rows), an interrupted one goes on from its checkpoint under runs/tuning/.
 """
 
+import csv
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
@@ -28,17 +33,22 @@ EPISODES = {"findtreasure": 2500, "pushbox": 5000, "gotogether": 2500, "cleaner"
 # These worlds take the best learning rate of the world whose networks are of the same or nearest size.
 NEAREST = {"gotogether": "findtreasure", "cleaner": "pushbox", "movebox": "pushbox"}
 LEARNING_RATES = {"sign": (1e-4, 3e-4, 1e-3), "adam": (3e-4, 1e-3, 3e-3)}
-# The number of a method's own that is tuned, and its values in each world; pg has none, and so nothing to tune elsewhere.
-OWN = {
-    "pg": {"findtreasure": ("", (None,)), "pushbox": ("", (None,))},
-    "decespg": {
-        "findtreasure": ("beta", (0.03, 0.1, 0.3)),
-        "pushbox": ("beta", (1.0, 3.0, 10.0)),
-        "gotogether": ("beta", (0.03, 0.1, 0.3)),
-        "cleaner": ("beta", (0.01, 0.03, 0.1)),
-        "movebox": ("beta", (0.3, 1.0, 3.0)),
-    },
+BETAS = {
+    "findtreasure": (0.03, 0.1, 0.3),
+    "pushbox": (1.0, 3.0, 10.0),
+    "gotogether": (0.03, 0.1, 0.3),
+    "cleaner": (0.01, 0.03, 0.1),
+    "movebox": (0.3, 1.0, 3.0),
 }
+# The number of a method's own that is tuned, and its values in each world; pg has none.
+OWN = {
+    "pg": ("", dict.fromkeys(EPISODES, (None,))),
+    "epg": ("beta", BETAS),
+    "spg": ("slots", dict.fromkeys(EPISODES, (1, 3, 10))),
+    "espg": ("beta", BETAS),
+    "decespg": ("beta", BETAS),
+}
+COLUMNS = ("world", "optimizer", "learning_rate", "own", "last 5 %", "worst trial", "all episodes", "chosen")
 
 
 @dataclass(frozen=True)
@@ -46,76 +56,91 @@ class Cell:
     """One run of the grid."""
 
     method: str
-    env: str
+    world: str
     optimizer: str
     learning_rate: float
-    own: str
     value: float | None
 
     @property
-    def run_dir(self):
-        own = f"-{self.own}={self.value}" if self.own else ""
-        return ROOT / "runs" / "tuning" / self.method / self.env / f"{self.optimizer}-learning_rate={self.learning_rate}{own}"
-
-    @property
-    def result(self):
-        return self.run_dir / "episodes.npz"
+    def key(self):
+        """What the first columns of the table say."""
+        return self.world, self.optimizer, f"{self.learning_rate:g}", "" if self.value is None else f"{self.value:g}"
 
     def run(self):
-        """Train; returns the last line of what the script says if it fails, None if it does not."""
-        if self.result.exists():
-            return None
-        command = [sys.executable, ROOT / "algos" / f"{self.method}.py", "--env", self.env, "--seed", 1000, "--num-trials", 5]
-        command += ["--num-episodes", EPISODES[self.env], "--optimizer", self.optimizer, "--learning-rate", self.learning_rate]
-        command += ["--run-dir", self.run_dir, *([f"--{self.own}", self.value] if self.own else [])]
-        command += ["--resume"] if (self.run_dir / "checkpoint.pt").exists() else []
-        done = subprocess.run([str(word) for word in command], capture_output=True, text=True)
-        return None if done.returncode == 0 else done.stderr.strip().splitlines()[-1]
-
-    def scores(self):
-        """Mean reward per step over the last 5 % of the episodes and over all, and the mean of each trial over the last 5 %."""
-        episodes = np.load(self.result)
+        """Train; returns mean reward per step over the last 5 % of the episodes, that of the worst trial, and over all."""
+        own, _ = OWN[self.method]
+        run_dir = ROOT / "runs" / "tuning" / self.method / "-".join(word for word in self.key if word)
+        command = [sys.executable, ROOT / "algos" / f"{self.method}.py", "--env", self.world, "--seed", 1000, "--num-trials", 5]
+        command += ["--num-episodes", EPISODES[self.world], "--optimizer", self.optimizer, "--run-dir", run_dir]
+        command += ["--learning-rate", self.learning_rate, *([f"--{own.replace('_', '-')}", self.value] if own else [])]
+        if not (run_dir / "episodes.npz").exists():
+            command += ["--resume"] if (run_dir / "checkpoint.pt").exists() else []
+            subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
+        episodes = np.load(run_dir / "episodes.npz")
         score = envs.reward_per_step(episodes["returns"], episodes["lengths"])
         trials = score[:, -score.shape[1] // 20 :].mean(1)
-        return trials.mean(), score.mean(), trials
+        return trials.mean(), trials.min(), score.mean()
 
 
-def cells_of(method, env, optimizer):
-    """The cells of one world and optimiser."""
-    own, values = OWN[method][env]
-    rates = [best(method, NEAREST[env], optimizer).learning_rate] if env in NEAREST else LEARNING_RATES[optimizer]
-    return [Cell(method, env, optimizer, rate, own, value) for rate, value in product(rates, values)]
+class Table:
+    """benchmark/tuning/<method>.csv: {key of a cell: (last 5 %, worst trial, all episodes)}."""
+
+    def __init__(self, method):
+        self.method, self.path, self.rows = method, ROOT / "benchmark" / "tuning" / f"{method}.csv", {}
+        self.lock = threading.Lock()
+        if self.path.exists():
+            with self.path.open(newline="") as file:
+                _, *rows = csv.reader(file)
+            self.rows = {tuple(row[:4]): tuple(map(float, row[4:7])) for row in rows}
+
+    def cells(self, world, optimizer):
+        """The grid of one world and optimiser."""
+        rates = LEARNING_RATES[optimizer]
+        if world in NEAREST:
+            rates = [self.best(NEAREST[world], optimizer).learning_rate]
+        return [Cell(self.method, world, optimizer, *cell) for cell in product(rates, OWN[self.method][1][world])]
+
+    def finished(self, world, optimizer):
+        """Whether all cells of a world and optimiser have a row."""
+        if world in NEAREST and not self.finished(NEAREST[world], optimizer):
+            return False
+        return all(cell.key in self.rows for cell in self.cells(world, optimizer))
+
+    def best(self, world, optimizer):
+        """The cell that the rule chooses, out of finished ones."""
+        return max(self.cells(world, optimizer), key=lambda cell: (self.rows[cell.key][0], self.rows[cell.key][2]))
+
+    def add(self, cell, scores):
+        """Write the table anew with one more row."""
+        with self.lock:
+            self.rows[cell.key] = tuple(float(f"{score:.4f}") for score in scores)
+            chosen = [self.best(*pair).key for pair in product(EPISODES, LEARNING_RATES) if self.finished(*pair)]
+            self.path.parent.mkdir(exist_ok=True)
+            with envs.complete_file(self.path) as file:
+                lines = [COLUMNS, *((*key, *row, "yes" * (key in chosen)) for key, row in sorted(self.rows.items(), key=order))]
+                file.write("".join(",".join(map(str, line)) + "\n" for line in lines).encode())
 
 
-def best(method, env, optimizer):
-    """The cell that the rule chooses, out of finished ones."""
-    return max(cells_of(method, env, optimizer), key=lambda cell: cell.scores()[:2])
+def order(item):
+    """Rows stand in the order of the grid."""
+    (world, optimizer, learning_rate, own), _ = item
+    return list(EPISODES).index(world), list(LEARNING_RATES).index(optimizer), float(learning_rate), float(own or 0)
 
 
-def table(method):
-    """The whole grid as a Markdown page; the best cell of each world and optimiser in bold."""
-    own = next(iter(OWN[method].values()))[0]
-    head = ["world", "optimiser", "learning rate", own or "-", "last 5 %", "worst trial", "all episodes"]
-    lines = [f"# {method}: the tuning grid", "", f"Made by `python benchmark/tune.py {method}`, which says how.", ""]
-    lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
-    for env, optimizer in product(OWN[method], LEARNING_RATES):
-        cells = cells_of(method, env, optimizer)
-        if not all(cell.result.exists() for cell in cells):
-            continue
-        for cell in cells:
-            last, overall, trials = cell.scores()
-            value = "-" if cell.value is None else f"{cell.value:g}"
-            row = [env, optimizer, f"{cell.learning_rate:g}", value, f"{last:.2f}", f"{trials.min():.2f}", f"{overall:.2f}"]
-            chosen = cell == best(method, env, optimizer)
-            lines.append("| " + " | ".join(f"**{word}**" if chosen else word for word in row) + " |")
-    return "\n".join(lines) + "\n"
+def run_cells(tables, cells, jobs):
+    """Run cells side by side, each into its table as it ends; exits with 1 after the last if one has failed."""
+    failed, bar = [], tqdm(total=len(cells), unit="run")
 
+    def run(cell):
+        try:
+            tables[cell.method].add(cell, cell.run())
+        except subprocess.CalledProcessError as error:
+            failed.append(f"{cell}: {error.stderr.strip().splitlines()[-1]}")
+        bar.update()
 
-def run_all(cells, jobs):
-    """Run cells side by side; exits with 1 after the last if one has failed."""
     with ThreadPoolExecutor(jobs) as pool:
-        errors = list(tqdm(pool.map(Cell.run, cells), total=len(cells), unit="run"))
-    failed = [f"{cell.run_dir}: {error}" for cell, error in zip(cells, errors, strict=True) if error]
+        list(pool.map(run, cells))
+    bar.close()
     if failed:
         print("\n".join(failed), file=sys.stderr)
         sys.exit(1)
@@ -127,7 +152,7 @@ def main(
     optimizers: tuple[Literal["sign", "adam"], ...] = tuple(LEARNING_RATES),
     jobs: int = 2,
 ):
-    """Run the tuning grid of some methods and write the tables of what is finished.
+    """Run what is missing in the tuning grid of some methods.
 
     Args:
         methods: scripts of algos/ without .py
@@ -139,14 +164,15 @@ def main(
         for word in set(words) - set(known):
             print(f"tune.py: there is no {what} {word!r}; there is {', '.join(known)}.", file=sys.stderr)
             sys.exit(2)
-    for stage in (set(worlds) - set(NEAREST), set(worlds) & set(NEAREST)):  # the second needs what the first finds
-        wanted = [(m, env, o) for m in methods for env in OWN[m] for o in optimizers if env in stage]
-        run_all([cell for group in wanted for cell in cells_of(*group)], jobs)
+    tables = {method: Table(method) for method in methods}
+    needed = [NEAREST.get(world, world) for world in worlds]
+    for stage in ([w for w in EPISODES if w in needed], [w for w in NEAREST if w in worlds]):  # the second needs the first
+        cells = [cell for group in product(methods, stage, optimizers) for cell in tables[group[0]].cells(*group[1:])]
+        run_cells(tables, [cell for cell in cells if cell.key not in tables[cell.method].rows], jobs)
     for method in methods:
-        path = ROOT / "benchmark" / "tuning" / f"{method}.md"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(table(method))
-        print(f"wrote {path}\n\n{table(method)}")
+        print(tables[method].path.relative_to(ROOT))
+        for pair in product(worlds, optimizers):
+            print("  ", *pair, tables[method].best(*pair).key[2:], *tables[method].rows[tables[method].best(*pair).key])
 
 
 if __name__ == "__main__":

@@ -1,0 +1,132 @@
+"""The comparison's unit of work: a cell is a script on a world with one optimiser and a block of seeds, run in one process."""
+
+import hashlib
+import importlib
+import json
+import sys
+from dataclasses import dataclass, fields
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+import envs
+
+RUNS = ROOT / "runs" / "comparison"
+WORLDS = tuple(envs.WORLDS)
+OPTIMIZERS = ("sign", "adam")
+# In the order of the paper and of every table.
+METHODS = {
+    "pg": "PG",
+    "epg": "EPG",
+    "spg": "SPG",
+    "espg": "ESPG",
+    "decespg": "DecESPG",
+}
+
+
+@cache
+def script(method):
+    """A script of algos/ as a module."""
+    return importlib.import_module(f"algos.{method}")
+
+
+def has_policies(method):
+    """Whether a method has policy networks, and so a choice of their optimiser; Q-learning has none and always uses Adam."""
+    return any(field.name == "optimizer" for field in fields(script(method).Args))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of the comparison, everything that is not named here at its default."""
+
+    method: str
+    world: str
+    optimizer: str
+    first_seed: int = 1
+    num_trials: int = 20
+    num_episodes: int | None = None  # None: Table 1
+    runs: Path = RUNS  # under which the cells work
+
+    @property
+    def arguments(self):
+        """What the script is told, {argument: value}."""
+        told = dict(env=self.world, seed=self.first_seed, num_trials=self.num_trials)
+        if has_policies(self.method):
+            told["optimizer"] = self.optimizer
+        return told if self.num_episodes is None else {**told, "num_episodes": self.num_episodes}
+
+    @cached_property
+    def settings(self):
+        """Everything that the result depends on: the arguments with their defaults filled in, as args.json holds them."""
+        module = script(self.method)
+        args, _ = module.resolve(module.Args(**self.arguments))
+        values = {name: value for name, value in vars(args).items() if name not in module.HOUSEKEEPING}
+        return json.loads(json.dumps({"method": self.method, **values}))
+
+    @property
+    def name(self):
+        """Short, unique among cells of the same settings."""
+        seeds = f"{self.first_seed}-{self.first_seed + self.num_trials - 1}"
+        return f"{self.world}/{self.method}/{self.optimizer}-seeds{seeds}-episodes{self.settings['num_episodes']}"
+
+    @property
+    def run_dir(self):
+        """Where the script works: other settings are another directory."""
+        digest = hashlib.sha256(json.dumps(self.settings, sort_keys=True).encode()).hexdigest()
+        return self.runs / f"{self.name}-{digest[:8]}"
+
+    @property
+    def log(self):
+        """What the script says while it runs."""
+        return self.run_dir / "output.txt"
+
+    @property
+    def command(self):
+        """The command that runs the cell from its beginning."""
+        words = [word for name, value in self.arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+        return [sys.executable, f"algos/{self.method}.py", *words, "--run-dir", str(self.run_dir)]
+
+    @property
+    def finished(self):
+        """Whether the result is there, complete and from these settings."""
+        return (self.run_dir / "episodes.npz").exists() and not self.broken
+
+    @property
+    def broken(self):
+        """What is wrong with the result that is there; empty if nothing is."""
+        path = self.run_dir / "episodes.npz"
+        if not path.exists():
+            return ""
+        try:
+            with np.load(path) as episodes:
+                shapes = {episodes[name].shape for name in ("returns", "lengths", "outcomes")}
+            found = settings_of(self.run_dir)
+        except Exception as error:  # whatever can be wrong with a file
+            return f"{path} cannot be read ({type(error).__name__})"
+        if shapes != {(self.num_trials, self.settings["num_episodes"])}:
+            return f"{path} holds arrays of another shape"
+        return "" if found == self.settings else f"{self.run_dir}/args.json is from other settings"
+
+
+def settings_of(run_dir):
+    """The settings of a run that is there, in the form of `Cell.settings`."""
+    about = json.loads((run_dir / "args.json").read_text())
+    housekeeping = script(about["method"]).HOUSEKEEPING
+    return {"method": about["method"], **{k: v for k, v in about["args"].items() if k not in housekeeping}}
+
+
+def select(methods, worlds, optimizers, **block):
+    """The cells of a selection, in the order of the tables; a method without policies has one cell, under "adam".
+
+    block: the other fields of all cells
+    """
+    return [
+        Cell(method, world, optimizer, **block)
+        for world in worlds
+        for method in methods
+        for optimizer in optimizers
+        if has_policies(method) or optimizer == "adam"
+    ]

@@ -1,0 +1,282 @@
+"""Run the comparison, cell by cell; `./benchmark.sh` calls it.
+
+A cell is a script on a world with one optimiser and a block of seeds (20 trials by default), one process on one core. Cells
+whose result is there are skipped, interrupted ones go on from their checkpoint: kill this at any moment and call it again.
+"""
+
+import fcntl
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, select
+
+# Seconds that 1000 episodes of 20 trials of decespg.py took on a 3 GHz core: for the order of cells that nobody has timed.
+SECONDS = {"cleaner": 240, "findtreasure": 7, "gotogether": 250, "movebox": 300, "pushbox": 4}
+
+
+@dataclass
+class Args:
+    algos: tuple[str, ...] = tuple(METHODS)
+    """scripts of algos/, without .py"""
+    envs: tuple[str, ...] = WORLDS
+    """worlds"""
+    optimizers: tuple[Literal["sign", "adam"], ...] = OPTIMIZERS
+    """optimisers of the policies"""
+    seeds: str = "1-20"
+    """first and last seed; all trials of a cell run side by side in one process"""
+    episodes: int | None = None
+    """training episodes of each trial (None: Table 1); a smoke run: --episodes 50"""
+    jobs: int = int(os.environ.get("JOBS", os.cpu_count() or 1))
+    """cells that run at the same time, one core each (also: the variable JOBS)"""
+    checkpoint_every: float = 60.0
+    """seconds between two checkpoints of a cell"""
+    runs: Path = RUNS
+    """directory under which the cells work"""
+    dry_run: bool = False
+    """only list the cells, their numbers and states"""
+    status: bool = False
+    """only show where the cells are"""
+    cell: int | None = None
+    """run exactly the cell of this number in the selection's list: the contract for every scheduler"""
+
+
+def remaining_seconds(cell, done=0):
+    """A guess of how long a cell still takes after `done` episodes, from SECONDS."""
+    return SECONDS[cell.world] * (cell.settings["num_episodes"] - done) * cell.num_trials / 20_000
+
+
+def progress(cell):
+    """Episodes that the last progress bar in a cell's output counts; 0 if there is none."""
+    try:
+        with cell.log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 2000))
+            counts = re.findall(rb"(\d+)/\d+ \[", file.read())
+    except FileNotFoundError:
+        return 0
+    return int(counts[-1]) if counts else 0
+
+
+def last_line(cell):
+    """The last line of a cell's output."""
+    lines = cell.log.read_text(errors="replace").replace("\r", "\n").split("\n") if cell.log.exists() else []
+    return next((line.strip() for line in reversed(lines) if line.strip()), "no output")
+
+
+@contextmanager
+def owned(cell, wait=True):
+    """Own a cell's directory: yields an open file whose lock lasts as long as any process holds it, None if another does."""
+    cell.run_dir.mkdir(parents=True, exist_ok=True)
+    with (cell.run_dir / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield None
+            return
+        yield file
+
+
+def state(cell):
+    """finished, broken, running, stopped (it has a checkpoint), failed or new."""
+    if cell.finished:
+        return "finished"
+    if not cell.run_dir.exists():
+        return "new"
+    with owned(cell, wait=False) as lock:
+        if lock is None:
+            return "running"
+    if cell.broken:
+        return "broken"
+    if (cell.run_dir / "exit_code").exists():
+        return "failed"
+    return "stopped" if (cell.run_dir / "checkpoint.pt").exists() else "new"
+
+
+class Job:
+    """A cell that is being run: its process, and how it ended."""
+
+    def __init__(self, cell, checkpoint_every):
+        self.cell, self.checkpoint_every, self.process, self.code, self.seconds, self.stopped = (
+            cell,
+            checkpoint_every,
+            None,
+            None,
+            0.0,
+            False,
+        )
+
+    def run(self):
+        """Run the cell from where it stands, unless it is finished; waits for another process that runs it already."""
+        cell, start = self.cell, time.monotonic()
+        with owned(cell) as lock:
+            if cell.finished or self.stopped:
+                self.code = 0 if cell.finished else -signal.SIGTERM
+                return
+            (cell.run_dir / "exit_code").unlink(missing_ok=True)
+            resume = (cell.run_dir / "checkpoint.pt").exists() and not cell.broken
+            command = [*cell.command, "--checkpoint-every", str(self.checkpoint_every)]
+            command.append("--resume" if resume else "--overwrite")
+            one_thread = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+            with cell.log.open("ab" if resume else "wb") as log:
+                # The script inherits the lock: should this runner die, nobody else starts the cell while the script goes on.
+                kinds = dict(stdout=log, stderr=log, cwd=ROOT, env={**os.environ, **one_thread}, pass_fds=[lock.fileno()])
+                self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **kinds)
+            self.code = self.process.wait()
+            self.seconds = time.monotonic() - start
+            timed = cell.run_dir / "seconds"
+            before = float(timed.read_text()) if resume and timed.exists() else 0.0
+            timed.write_text(f"{before + self.seconds:.1f}\n")
+            if self.code != 0 and not self.stopped:
+                (cell.run_dir / "exit_code").write_text(f"{self.code}\n")
+
+    def stop(self):
+        """Ask for a checkpoint and the end."""
+        self.stopped = True
+        if self.process is not None and self.process.poll() is None:
+            self.process.send_signal(signal.SIGTERM)
+
+
+class Runner:
+    """Runs cells, `jobs` at a time, the longest first, and shows how far they are."""
+
+    def __init__(self, cells, jobs, checkpoint_every):
+        cells = sorted(cells, key=lambda cell: -remaining_seconds(cell, progress(cell)))
+        self.waiting = [Job(cell, checkpoint_every) for cell in cells]
+        self.jobs, self.running, self.ended, self.stopping = jobs, {}, [], False
+        self.lines, self.began = 0, time.monotonic()
+
+    def run(self):
+        """Run all; returns the jobs in the order of their ends."""
+        handlers = {s: signal.signal(s, self._stop) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while self.running or (self.waiting and not self.stopping):
+                while self.waiting and len(self.running) < self.jobs and not self.stopping:
+                    job = self.waiting.pop(0)
+                    self.running[job] = threading.Thread(target=job.run, daemon=True)
+                    self.running[job].start()
+                time.sleep(0.2)
+                for job in [job for job, thread in self.running.items() if not thread.is_alive()]:
+                    del self.running[job]
+                    self.ended.append(job)
+                    how = "finished" if job.code == 0 else "stopped" if job.stopped else f"FAILED with code {job.code}"
+                    self._say(f"{job.cell.name}: {how} after {clock(job.seconds)}")
+                self._show()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        return self.ended
+
+    def _stop(self, *_):
+        self.stopping = True
+        for job in self.running:
+            job.stop()
+
+    def _say(self, line):
+        self._clear()
+        print(line, flush=True)
+
+    def _clear(self):
+        if self.lines:
+            print(f"\x1b[{self.lines}A\x1b[J", end="")
+            self.lines = 0
+
+    def _show(self):
+        """A line for every running cell and one for all, rewritten in place; nothing where nobody looks."""
+        if not sys.stdout.isatty():
+            return
+        self._clear()
+        lines, left = [], sum(remaining_seconds(job.cell) for job in self.waiting)
+        for job in self.running:
+            done, total = progress(job.cell), job.cell.settings["num_episodes"]
+            left += remaining_seconds(job.cell, done)
+            lines.append(f"  {job.cell.name:<60} {done:>6}/{total} {done / total:4.0%}")
+        ended, total = len(self.ended), len(self.ended) + len(self.running) + len(self.waiting)
+        lines.append(f"{ended} of {total} cells, {clock(time.monotonic() - self.began)}, about {clock(left / self.jobs)} left")
+        print("\n".join(lines), flush=True)
+        self.lines = len(lines)
+
+
+def clock(seconds):
+    """h:mm:ss"""
+    return f"{int(seconds) // 3600}:{int(seconds) // 60 % 60:02d}:{int(seconds) % 60:02d}"
+
+
+def refuse(message):
+    """End with one sentence and code 2."""
+    print(f"benchmark.sh: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+def selection(args):
+    """The cells that the arguments select."""
+    for what, words, known in (("script", args.algos, METHODS), ("world", args.envs, WORLDS)):
+        for word in words:
+            if word not in known:
+                refuse(f"there is no {what} {word!r}; there is {', '.join(known)}.")
+    if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", args.seeds)) or int(found[2] or found[1]) < int(found[1]):
+        refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
+    for name in ("episodes", "jobs"):
+        if (value := getattr(args, name)) is not None and value < 1:
+            refuse(f"--{name} must be a number of at least 1, not {value}.")
+    first, last = int(found[1]), int(found[2] or found[1])
+    block = dict(first_seed=first, num_trials=last - first + 1, num_episodes=args.episodes, runs=args.runs.absolute())
+    cells = select(args.algos, args.envs, args.optimizers, **block)
+    if not cells:
+        refuse("nothing is selected; a method without policies is run under adam only.")
+    return cells
+
+
+def show_states(cells):
+    """A line for every cell: number, name, state."""
+    for number, cell in enumerate(cells):
+        word = state(cell)
+        detail = cell.broken if word == "broken" else last_line(cell) if word == "failed" else ""
+        if word in ("running", "stopped"):
+            detail = f"{progress(cell)} of {cell.settings['num_episodes']} episodes"
+        print(f"{number:>4}  {cell.name:<60} {word:<9} {detail}".rstrip())
+
+
+def report(skipped, jobs, waiting):
+    """What became of the cells; returns the exit code."""
+    failed = [job for job in jobs if job.code != 0 and not job.stopped]
+    finished = [job for job in jobs if job.code == 0]
+    rest = len(waiting) + len(jobs) - len(failed) - len(finished)
+    print(f"\n{len(finished)} finished, {len(failed)} failed, {len(skipped)} skipped (finished before), {rest} not finished")
+    for job in failed:
+        print(f"  {job.cell.name}: code {job.code}: {last_line(job.cell)}")
+        print(f"    again: {shlex.join([*job.cell.command, '--overwrite'])}")
+    return 1 if failed else 143 if rest else 0
+
+
+def main():
+    """Run, list or show the cells of a selection."""
+    args = tyro.cli(Args, description=__doc__)
+    cells = selection(args)
+    if args.dry_run or args.status:
+        return show_states(cells)
+    if args.cell is not None:
+        if not 0 <= args.cell < len(cells):
+            refuse(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")
+        cells = [cells[args.cell]]
+    for cell in cells:
+        if cell.broken:
+            print(f"{cell.broken}; it is run again.")
+    skipped = [cell for cell in cells if cell.finished]
+    runner = Runner([cell for cell in cells if cell not in skipped], args.jobs, args.checkpoint_every)
+    sys.exit(report(skipped, runner.run(), runner.waiting))
+
+
+if __name__ == "__main__":
+    main()
