@@ -46,22 +46,23 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/decespg.md). Where its table has no row yet, the
 # learning rate is that of the rule and beta a guess.
 TUNED = {
-    ("cleaner", "sign"): dict(learning_rate=1e-4, beta=0.03),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.1),
-    ("movebox", "sign"): dict(learning_rate=1e-4, beta=1.0),
-    ("movebox", "adam"): dict(learning_rate=3e-4, beta=1.0),
-    ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0),
-    ("pushbox", "adam"): dict(learning_rate=3e-4, beta=10.0),
+    ("cleaner", "sign"): dict(learning_rate=1e-4, beta=0.03, slots=10),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, slots=10),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, slots=10),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, slots=10),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, slots=10),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.1, slots=10),
+    ("movebox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=1.0, slots=10),
+    ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, beta=10.0, slots=10),
 }
 # The lowest and highest value of every number that makes sense.
 LIMITS = dict(
     **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
     **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
-    **dict(beta=(0, np.inf), window=(1, np.inf), sigma=(1e-3, np.inf), noise=(1e-6, np.inf), slots=(0, np.inf)),
+    **dict(beta=(0, np.inf), window=(1, np.inf), sigma=(1e-3, np.inf), noise=(1e-6, np.inf)),
+    **dict(slots=(0, np.inf)),
 )
 
 
@@ -108,13 +109,13 @@ class Args:
     beta: float | None = None
     """weight of the exploration bonus, in units of reward (beta of Eq. 9; None: tuned for world and optimiser)"""
     window: int = 50
-    """visits that each agent remembers (m of Section 3.1.4)"""
+    """visits that are remembered (m of Section 3.1.4)"""
     sigma: float = 0.5
     """width of the kernel (sigma of Eq. 5), in cells where agents observe positions, else in units of the observation"""
     noise: float = 0.01
     """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
-    slots: int = 10
-    """episodes that the memory keeps for each terminal state; 0 switches it off"""
+    slots: int | None = None
+    """episodes that the memory keeps for each terminal state (None: tuned for world and optimiser); 0 switches it off"""
 
 
 class StackedMLP:
@@ -328,31 +329,31 @@ def slide_inverse(inverse, product, kernel, slot, full, diagonal):
 
 
 @njit(cache=True)
-def visit_counts(obs, actions, lengths, past_obs, past_actions, inverses, visits, sigma, noise):
-    """The bounded visit count eta of each step of an episode, which is then remembered; every agent by itself.
+def visit_counts(pairs, lengths, rings, inverses, visits, sigma, noise):
+    """The bounded visit count eta of each pair u of an episode, which is then remembered; every window by itself.
 
-    obs [T, num_trials, num_agents, obs_dim], actions [T, num_trials, num_agents], lengths [num_trials] -> eta, shaped as
-    actions, 1 beyond the episode's end. What is remembered stands in rings, visit number n in row n mod m:
-    past_obs [num_trials, num_agents, obs_dim, m], past_actions [.., m], inverses [.., m, m]; visits [num_trials] counts them.
+    pairs [T, num_trials, num_windows, pair_dim], lengths [num_trials] -> eta [T, num_trials, num_windows], 1 beyond the
+    episode's end. What is remembered stands in rings [num_trials, num_windows, pair_dim, m], visit number n in column n mod m,
+    and in inverses [num_trials, num_windows, m, m]; visits [num_trials] counts them.
     """
-    _, trials, agents, dim = obs.shape
-    m = past_actions.shape[2]
-    eta = np.ones(actions.shape)
+    _, trials, windows, dim = pairs.shape
+    m = rings.shape[3]
+    eta = np.ones((len(pairs), trials, windows))
     kernel, product = np.empty(m), np.empty(m)
     for k in range(trials):
-        for i in range(agents):
-            inverse, ring_obs, ring_actions = inverses[k, i], past_obs[k, i], past_actions[k, i]
+        for w in range(windows):
+            ring, inverse = rings[k, w], inverses[k, w]
             for t in range(lengths[k]):
                 visit = visits[k] + t
-                # Eq. 5 with C = 1, for u = (o, one-hot a): two different actions are a squared distance of 2 apart.
-                for r in range(m):
-                    kernel[r] = 2.0 * (ring_actions[r] != actions[t, k, i])
+                # Eq. 5 with C = 1.
+                kernel[:] = 0.0
                 for d in range(dim):
+                    value = np.float64(pairs[t, k, w, d])
                     for r in range(m):
-                        kernel[r] += (obs[t, k, i, d] - ring_obs[d, r]) ** 2
+                        kernel[r] += (value - ring[d, r]) ** 2
                 for r in range(m):
-                    exponent = kernel[r] / (2.0 * sigma * sigma)
-                    kernel[r] = np.exp(-exponent) if r < visit and exponent < 40.0 else 0.0  # exp(-40) is nothing beside 1
+                    near = r < visit and kernel[r] < 80.0 * sigma * sigma  # exp(-40) is nothing beside 1
+                    kernel[r] = np.exp(-kernel[r] / (2.0 * sigma * sigma)) if near else 0.0
 
                 # Eq. 7 with targets 1, because every remembered pair was visited: eta = kernel^T inverse 1.
                 product[:] = 0.0
@@ -360,38 +361,35 @@ def visit_counts(obs, actions, lengths, past_obs, past_actions, inverses, visits
                     if kernel[r] > 0.0:
                         for c in range(m):
                             product[c] += kernel[r] * inverse[r, c]
-                eta[t, k, i] = product.sum()
+                eta[t, k, w] = product.sum()
 
                 slot = visit % m
                 slide_inverse(inverse, product, kernel, slot, visit >= m, 1.0 + noise)
-                ring_actions[slot] = actions[t, k, i]
-                for d in range(dim):
-                    ring_obs[d, slot] = obs[t, k, i, d]
+                ring[:, slot] = pairs[t, k, w]
     for k in range(trials):
         visits[k] += lengths[k]
     return eta
 
 
 class VisitNovelty:
-    """The exploration bonus of Section 3.1: every agent's private window of visits and the Gaussian process over it."""
+    """The exploration bonus of Section 3.1: windows over the last m visits, and a Gaussian process over each."""
 
-    def __init__(self, num_trials, num_agents, obs_dim, window, sigma, noise):
-        self.obs = np.zeros((num_trials, num_agents, obs_dim, window))
-        self.actions = np.zeros((num_trials, num_agents, window), np.int64)
-        self.inverse = np.zeros((num_trials, num_agents, window, window))
+    def __init__(self, num_trials, num_windows, pair_dim, window, sigma, noise):
+        self.pairs = np.zeros((num_trials, num_windows, pair_dim, window))
+        self.inverse = np.zeros((num_trials, num_windows, window, window))
         self.visits = np.zeros(num_trials, np.int64)
         self.sigma, self.noise = sigma, noise
-        self.state = [self.obs, self.actions, self.inverse, self.visits]
+        self.state = [self.pairs, self.inverse, self.visits]
 
-    def bonus(self, obs, actions, lengths):
-        """EB = -log eta of each step of an episode (Eq. 8), [T, num_trials, num_agents], and the shares of clamped steps.
+    def bonus(self, pairs, lengths):
+        """EB = -log eta of each pair u of an episode (Eq. 8), [T, num_trials, num_windows], and the shares of clamped ones.
 
         In the paper eta lies in (0, 1]; here it is clamped to [1e-3, 1], because a pair unlike all that is remembered has
         eta = 0 and a pair between several remembered ones may have eta > 1.
         """
-        eta = visit_counts(obs, actions, lengths, *self.state, self.sigma, self.noise)
-        steps = lengths * eta.shape[2]
-        return -np.log(eta.clip(1e-3, 1)), (eta < 1e-3).sum((0, 2)) / steps, (eta > 1).sum((0, 2)) / steps
+        eta = visit_counts(pairs, lengths, *self.state, self.sigma, self.noise)
+        visits = lengths * eta.shape[2]
+        return -np.log(eta.clip(1e-3, 1)), (eta < 1e-3).sum((0, 2)) / visits, (eta > 1).sum((0, 2)) / visits
 
 
 class SelectiveMemory:
@@ -462,7 +460,9 @@ def train(args: Args):
 
     policy = Policy(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
     optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
-    novelty = VisitNovelty(args.num_trials, num_agents, world.obs_dim, args.window, args.sigma * world.cell, args.noise)
+    one_hot = np.eye(world.num_actions, dtype=np.float32)
+    pair_dim = world.num_actions + world.obs_dim
+    novelty = VisitNovelty(args.num_trials, num_agents, pair_dim, args.window, args.sigma * world.cell, args.noise)
     memory = SelectiveMemory(env, args.slots)
     rollout = Rollout(env)
     uniforms = np.empty((args.num_trials, world.max_steps, num_agents))
@@ -478,7 +478,8 @@ def train(args: Args):
         reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
 
         # Augment each agent's reward with its own exploration bonus, Eq. 9, and remember the visits.
-        bonus, unvisited, overvisited = novelty.bonus(rollout.obs[:longest], rollout.actions[:longest], lengths)
+        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)
+        bonus, unvisited, overvisited = novelty.bonus(pairs, lengths)
         augmented = reward + args.beta * bonus
 
         # Update the selective memory, by the original reward.
@@ -492,7 +493,7 @@ def train(args: Args):
         loss = -(torch.from_numpy(weight) * log_probs).sum()
         optimizer.step(torch.autograd.grad(loss, policy.params))
 
-        mean_bonus = bonus.sum((0, 2)) / (lengths * num_agents)
+        mean_bonus = bonus.sum((0, 2)) / (lengths * bonus.shape[2])
         run.record(episode, rollout, bonus=mean_bonus, unvisited=unvisited, overvisited=overvisited)
     run.finish(policy)
     return SimpleNamespace(policy=policy, novelty=novelty, memory=memory, log=run.log)

@@ -10,6 +10,7 @@ import json
 import sys
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import matplotlib
@@ -87,6 +88,13 @@ def take_in(runs):
         result, path = Result.of_run(file.parent), STORE / cell.world / f"{cell.method}-{cell.optimizer}.npz"
         if not path.exists() or Result.load(path).num_episodes <= result.num_episodes:
             result.save(path)
+
+
+def kept():
+    """All results that are kept, {(world, method, optimizer): Result}."""
+    keys = product(WORLDS, METHODS, OPTIMIZERS)
+    paths = {(world, method, optimizer): STORE / world / f"{method}-{optimizer}.npz" for world, method, optimizer in keys}
+    return {key: Result.load(path) for key, path in paths.items() if path.exists()}
 
 
 @cache
@@ -195,10 +203,7 @@ def main(runs: Path = RUNS):
         runs: where the cells have worked
     """
     take_in(runs)
-    paths = {
-        (world, method, o): STORE / world / f"{method}-{o}.npz" for world in WORLDS for method in METHODS for o in OPTIMIZERS
-    }
-    results = {key: Result.load(path) for key, path in paths.items() if path.exists()}
+    results = kept()
     for name, methods in FIGURES.items():
         draw_figure(name, methods, results)
     readme = rewrite(README.read_text(), "scores", score_table(results))

@@ -73,10 +73,11 @@ def bonus_speed(window, visits=20_000):
             obs[t], _ = env.reset()
         if t + 1 < visits:
             obs[t + 1] = env.step(actions[t])[0]
-    novelty = script.VisitNovelty(1, world.num_agents, world.obs_dim, window, 0.5 * world.cell, 0.01)
-    novelty.bonus(obs[:window], actions[:window], np.array([window]))
+    pairs = np.concatenate([np.eye(world.num_actions, dtype=np.float32)[actions], obs], axis=3)
+    novelty = script.VisitNovelty(1, world.num_agents, pairs.shape[3], window, 0.5 * world.cell, 0.01)
+    novelty.bonus(pairs[:window], np.array([window]))
     start = time.perf_counter()
-    novelty.bonus(obs, actions, np.array([visits]))
+    novelty.bonus(pairs, np.array([visits]))
     return (time.perf_counter() - start) / (visits * world.num_agents) * 1e6
 
 

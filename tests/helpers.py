@@ -190,6 +190,37 @@ def assert_same_direction(direction, params, steps_of):
             assert np.allclose(found[net], expected, rtol=1e-4, atol=1e-5 * max(1.0, float(expected.abs().max())))
 
 
+def pairs(obs, actions, num_actions):
+    """The vectors u = (o, one-hot a) of an agent's steps, [T, obs_dim + num_actions]."""
+    return np.concatenate([np.asarray(obs), np.eye(num_actions)[actions]], axis=1).astype(np.float32)
+
+
+def kernel(some, others, sigma):
+    """Eq. 5 with C = 1."""
+    return np.exp(-((some[:, None].astype(float) - others[None]) ** 2).sum(-1) / (2 * sigma**2))
+
+
+def dense_eta(visited, t, window, sigma, noise):
+    """eta of the pair visited[t] after all pairs before it, by Eqs. 5-7 with targets 1 and a dense solve."""
+    past = visited[max(0, t - window) : t]
+    covariance = kernel(past, past, sigma) + noise * np.eye(len(past))
+    return float(kernel(visited[t : t + 1], past, sigma)[0] @ np.linalg.solve(covariance, np.ones(len(past))))
+
+
+def memory_steps(episodes, i):
+    """Agent i's steps (o*, a*, w_k G*_t / T_k) in the episodes k that Eqs. 15-16 replay, w_k = Psi*_k / sum_j Psi*_j.
+
+    An episode is (observations [T, num_agents, obs_dim], actions [T, num_agents], returns [T]).
+    """
+    replayed = [episode for episode in episodes if episode[2][0] > 0]
+    total = sum(returns[0] for _, _, returns in replayed)
+    return [
+        (obs[t, i], actions[t, i], returns[0] / total * returns[t] / len(returns))
+        for obs, actions, returns in replayed
+        for t in range(len(returns))
+    ]
+
+
 def use_double_precision(module, monkeypatch):
     """Let the networks of a script calculate in double precision, in which rounding does not grow into sight."""
 

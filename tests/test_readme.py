@@ -55,7 +55,7 @@ def test_the_worked_example_replaces_the_bonus(folder):
     changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: example + "\n\n", script, flags=re.DOTALL)
     changed = changed.replace("import numpy as np\n", "from collections import defaultdict\n\nimport numpy as np\n", 1)
     assert changed.count("class VisitNovelty") == 1
-    assert "visit_counts(obs" not in changed.replace("def visit_counts(obs", "")
+    assert "visit_counts(pairs" not in changed.replace("def visit_counts(pairs", "")
     (folder / "algos").mkdir()
     (folder / "algos" / "counts.py").write_text(changed)
     (folder / "envs").symlink_to(ROOT / "envs")

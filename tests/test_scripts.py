@@ -328,7 +328,8 @@ def test_the_episodes_agree_with_each_other(finished):
 
 def test_tensorboard_shows_the_means_between_its_points(finished):
     episodes = results(finished.directory)
-    own = {"decespg": ["bonus", "unvisited", "overvisited"], "pg": []}
+    bonus = ["bonus", "unvisited", "overvisited"]
+    own = {"pg": [], "spg": [], "epg": bonus, "espg": bonus, "decespg": bonus}
     usual = ["episodic_return", "episodic_length", "reward_per_step", "SPS"]
     for k in range(2):
         shown = curves(finished.directory / f"seed{5 + k}")
@@ -344,7 +345,7 @@ def test_tensorboard_shows_the_means_between_its_points(finished):
         for tag, values in expected.items():
             assert [value for _, value in shown[f"charts/{tag}"]] == pytest.approx(values, rel=1e-5)
         assert min(value for _, value in shown["charts/SPS"]) > 0
-        if finished.name == "decespg":
+        if own.get(finished.name):
             assert all(0 < value < np.log(1000) for _, value in shown["charts/bonus"])
             assert all(0 < value < 1 for _, value in shown["charts/unvisited"])
 
@@ -616,14 +617,18 @@ BAD_INPUT = {
     "--evaluate other.pt": "other.pt is not a policy.pt",
     "--evaluate folder": "folder is not a policy.pt",
 }
+BAD_BONUS = {
+    "--beta -1": "--beta must be a number of at least 0, not -1",
+    "--window 0": "--window must be a number of at least 1, not 0",
+    "--sigma 0": "--sigma must be a number of at least 0.001, not 0",
+    "--noise 0": "--noise must be a number of at least 1e-06, not 0",
+}
+BAD_MEMORY = {"--slots -1": "--slots must be a number of at least 0, not -1"}
 BAD_INPUT_OF = {
-    "decespg": {
-        "--beta -1": "--beta must be a number of at least 0, not -1",
-        "--window 0": "--window must be a number of at least 1, not 0",
-        "--sigma 0": "--sigma must be a number of at least 0.001, not 0",
-        "--noise 0": "--noise must be a number of at least 1e-06, not 0",
-        "--slots -1": "--slots must be a number of at least 0, not -1",
-    }
+    "spg": BAD_MEMORY,
+    "epg": BAD_BONUS,
+    "espg": BAD_BONUS | BAD_MEMORY,
+    "decespg": BAD_BONUS | BAD_MEMORY,
 }
 
 

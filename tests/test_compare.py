@@ -1,0 +1,264 @@
+"""benchmark.sh: its cells, what it skips, runs again and goes on with, what it says of failures, and real kills."""
+
+import dataclasses
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmark import compare
+from benchmark.cells import ROOT, Cell, select
+from tests.helpers import assert_one_sentence, script
+
+BLOCK = dict(first_seed=5, num_trials=2, num_episodes=1500)
+
+
+def start(runs, *words):
+    """Start ./benchmark.sh on two small cells, with a checkpoint after every episode; words may be more options."""
+    selected = (
+        "--algos pg decespg --envs findtreasure --optimizers sign --seeds 5-6 --episodes 1500 --jobs 2 --checkpoint-every 0"
+    )
+    command = [ROOT / "benchmark.sh", *selected.split(), "--runs", runs, *words]
+    environment = {**os.environ, "PYTHON": sys.executable}
+    kinds = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True)
+    return subprocess.Popen([str(word) for word in command], **kinds)
+
+
+def cells(runs):
+    """The cells of `start`."""
+    return select(["pg", "decespg"], ["findtreasure"], ["sign"], **BLOCK, runs=Path(runs))
+
+
+def wait_for_episode(cell, episode, seconds=60):
+    """Wait until a cell's progress bar has passed an episode."""
+    deadline = time.monotonic() + seconds
+    while compare.progress(cell) < episode:
+        assert time.monotonic() < deadline, cell.log.read_text() if cell.log.exists() else "nothing was started"
+        time.sleep(0.02)
+
+
+def process_of(cell):
+    """The process number of a running cell's script."""
+    found = subprocess.run(["pgrep", "-f", f"algos/{cell.method}.py.*{cell.run_dir}"], capture_output=True, text=True)
+    return int(found.stdout.split()[0])
+
+
+def episodes(cell):
+    with np.load(cell.run_dir / "episodes.npz") as file:
+        return dict(file)
+
+
+def test_killed_scripts_and_runners_lose_nothing(tmp_path):
+    expected = {}
+    whole = start(tmp_path / "whole")
+    assert whole.wait(120) == 0, whole.communicate()
+    for cell in cells(tmp_path / "whole"):
+        assert cell.finished
+        expected[cell.method] = episodes(cell)
+
+    # One script is killed: the other cell is finished, and the failure can't be overlooked.
+    runs = tmp_path / "killed"
+    pg, decespg = cells(runs)
+    first = start(runs)
+    wait_for_episode(decespg, 20)
+    os.kill(process_of(decespg), signal.SIGKILL)
+    said, _ = first.communicate(timeout=120)
+    assert first.returncode == 1
+    assert "1 finished, 1 failed, 0 skipped" in said
+    assert f"{decespg.name}: code -9" in said
+    assert "python algos/decespg.py --env findtreasure --seed 5 --num-trials 2" in said.replace(sys.executable, "python")
+    assert (pg.finished, decespg.finished) == (True, False)
+    assert compare.state(decespg) == "failed"
+
+    # Runner and script are killed while the cell goes on from its checkpoint.
+    finished_at, reached = (pg.run_dir / "episodes.npz").stat().st_mtime_ns, compare.progress(decespg)
+    second = start(runs)
+    wait_for_episode(decespg, reached + 20)
+    os.killpg(second.pid, signal.SIGKILL)
+    second.wait(60)
+    assert not decespg.finished
+
+    # The runner alone is killed: its script goes on, and the next runner waits for it instead of starting another.
+    reached = compare.progress(decespg)
+    third = start(runs)
+    wait_for_episode(decespg, reached + 20)
+    os.kill(third.pid, signal.SIGKILL)
+    third.wait(60)
+    assert compare.state(decespg) == "running"
+    last = start(runs)
+    said, _ = last.communicate(timeout=120)
+    assert (last.returncode, "0 failed" in said, "0 not finished" in said) == (0, True, True), said
+    assert decespg.log.read_text().count("usual end") == 1
+    assert (pg.run_dir / "episodes.npz").stat().st_mtime_ns == finished_at
+    for cell in (pg, decespg):
+        for name, values in expected[cell.method].items():
+            assert np.array_equal(episodes(cell)[name], values)
+
+
+def test_a_polite_stop_leaves_checkpoints(tmp_path):
+    _, decespg = cells(tmp_path)
+    runner = start(tmp_path)
+    wait_for_episode(decespg, 5)
+    runner.send_signal(signal.SIGTERM)
+    said, _ = runner.communicate(timeout=60)
+    assert runner.returncode == 143
+    assert "0 failed" in said
+    assert compare.state(decespg) == "stopped"
+    assert re.search(
+        r"findtreasure/decespg/\S+ +stopped +\d+ of 1500 episodes", start(tmp_path, "--status").communicate(timeout=60)[0]
+    )
+
+
+# --- what counts as done ---
+
+
+def finish(cell):
+    """Let a cell look finished."""
+    cell.run_dir.mkdir(parents=True, exist_ok=True)
+    shape = cell.num_trials, cell.settings["num_episodes"]
+    np.savez(cell.run_dir / "episodes.npz", returns=np.zeros(shape), lengths=np.ones(shape), outcomes=np.zeros(shape))
+    args = {**dataclasses.asdict(script(cell.method).Args()), **cell.settings}
+    about = {"method": args.pop("method"), "args": args}
+    (cell.run_dir / "args.json").write_text(json.dumps(about, default=str))
+
+
+@pytest.fixture
+def cell(tmp_path):
+    return Cell("pg", "pushbox", "sign", **BLOCK, runs=tmp_path)
+
+
+def test_a_complete_result_of_the_same_settings_is_finished(cell):
+    assert (cell.finished, cell.broken, compare.state(cell)) == (False, "", "new")
+    finish(cell)
+    assert (cell.finished, cell.broken, compare.state(cell)) == (True, "", "finished")
+
+
+def test_a_broken_result_is_named_and_not_finished(cell):
+    finish(cell)
+    path = cell.run_dir / "episodes.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    assert not cell.finished
+    assert str(path) in cell.broken
+    assert compare.state(cell) == "broken"
+
+
+@pytest.mark.parametrize("wrong", [dict(num_episodes=299), dict(num_trials=3)])
+def test_a_result_of_another_shape_is_broken(cell, wrong):
+    finish(cell)
+    other = dataclasses.replace(cell, **wrong)
+    other.run_dir.mkdir(parents=True)
+    for path in cell.run_dir.glob("*.*"):
+        (other.run_dir / path.name).write_bytes(path.read_bytes())
+    assert not other.finished
+    assert "another shape" in other.broken
+
+
+def test_a_result_of_other_settings_is_broken(cell):
+    finish(cell)
+    about = json.loads((cell.run_dir / "args.json").read_text())
+    about["args"]["gamma"] = 0.5
+    (cell.run_dir / "args.json").write_text(json.dumps(about))
+    assert not cell.finished
+    assert "other settings" in cell.broken
+
+
+def test_other_settings_are_another_directory(cell, monkeypatch):
+    others = [dict(num_episodes=200), dict(first_seed=6), dict(num_trials=3), dict(optimizer="adam"), dict(method="decespg")]
+    places = {dataclasses.replace(cell, **other).run_dir for other in others}
+    assert len({*places, cell.run_dir}) == 6
+    monkeypatch.setitem(script("pg").TUNED, ("pushbox", "sign"), dict(learning_rate=0.5))  # a change of the defaults
+    assert dataclasses.replace(cell).run_dir != cell.run_dir
+    assert dataclasses.replace(cell).name == cell.name
+
+
+def test_a_selection_is_a_numbered_list():
+    found = select(["pg", "decespg"], ["pushbox", "cleaner"], ["sign", "adam"])
+    assert [(cell.world, cell.method, cell.optimizer) for cell in found] == [
+        (world, method, optimizer)
+        for world in ("pushbox", "cleaner")
+        for method in ("pg", "decespg")
+        for optimizer in ("sign", "adam")
+    ]
+    assert {(cell.first_seed, cell.num_trials) for cell in found} == {(1, 20)}
+    assert found[0].settings["num_episodes"] == 20_000
+
+
+# --- the runner ---
+
+
+def command(monkeypatch, capsys, *words):
+    """Run benchmark/compare.py in this process: code, stdout, stderr."""
+    monkeypatch.setattr(sys, "argv", ["benchmark/compare.py", *map(str, words)])
+    try:
+        compare.main()
+        code = 0
+    except SystemExit as error:
+        code = error.code
+    return code, *capsys.readouterr()
+
+
+SMALL = ["--algos", "pg", "decespg", "--envs", "pushbox", "--optimizers", "sign", "--seeds", "1", "--episodes", "2"]
+
+
+def test_one_cell_is_the_contract_for_schedulers(tmp_path, monkeypatch, capsys):
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--cell", 1, "--runs", tmp_path)
+    assert (code, "1 finished, 0 failed, 0 skipped" in said) == (0, True)
+    _, said, _ = command(monkeypatch, capsys, *SMALL, "--dry-run", "--runs", tmp_path)
+    lines = [line.split() for line in said.splitlines()]
+    assert [(number, name.split("/")[1], state) for number, name, state in lines] == [
+        ("0", "pg", "new"),
+        ("1", "decespg", "finished"),
+    ]
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--cell", 1, "--runs", tmp_path)
+    assert (code, "0 finished, 0 failed, 1 skipped" in said) == (0, True)
+
+
+def test_a_failure_is_shown_with_its_last_line_and_its_command(tmp_path, monkeypatch, capsys):
+    failing = property(lambda self: [sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)"])
+    monkeypatch.setattr(Cell, "command", failing)
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--runs", tmp_path)
+    assert code == 1
+    assert "0 finished, 2 failed, 0 skipped" in said
+    assert said.count("code 3: the reason") == 2
+    assert said.count("again: ") == 2
+    _, said, _ = command(monkeypatch, capsys, *SMALL, "--status", "--runs", tmp_path)
+    assert said.count("failed    the reason") == 2
+
+
+def test_a_broken_result_is_said_and_run_again(tmp_path, monkeypatch, capsys):
+    cell = Cell("pg", "pushbox", "sign", num_trials=1, num_episodes=2, runs=tmp_path)
+    finish(cell)
+    (cell.run_dir / "episodes.npz").write_bytes(b"half")
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--cell", 0, "--runs", tmp_path)
+    assert code == 0
+    assert f"{cell.run_dir / 'episodes.npz'} cannot be read" in said
+    assert "1 finished" in said
+    assert cell.finished
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--algos ppo", "'ppo'"),
+        ("--envs pacman", "'pacman'"),
+        ("--seeds 5-2", "'5-2'"),
+        ("--seeds x", "'x'"),
+        ("--episodes 0", "not 0"),
+        ("--jobs 0", "not 0"),
+        ("--cell -1", "not -1"),
+        ("--cell 100000", "not 100000"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(words, said, monkeypatch, capsys):
+    code, out, err = command(monkeypatch, capsys, *words.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("benchmark.sh: ")
+    assert said in err
+    assert_one_sentence(err.removesuffix("\n"))
