@@ -47,14 +47,14 @@ WORLDS = {
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, beta=0.03),
     ("cleaner", "adam"): dict(learning_rate=1e-3, beta=0.03),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3),
-    ("findtreasure", "adam"): dict(learning_rate=1e-3, beta=0.3),
+    ("findtreasure", "sign"): dict(learning_rate=3e-4, beta=0.1),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03),
     ("gotogether", "adam"): dict(learning_rate=1e-3, beta=0.1),
     ("movebox", "sign"): dict(learning_rate=3e-4, beta=1.0),
     ("movebox", "adam"): dict(learning_rate=1e-3, beta=1.0),
-    ("pushbox", "sign"): dict(learning_rate=3e-4, beta=1.0),
-    ("pushbox", "adam"): dict(learning_rate=1e-3, beta=10.0),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0),
+    ("pushbox", "adam"): dict(learning_rate=3e-3, beta=1.0),
 }
 # The lowest and highest value of every number that makes sense.
 LIMITS = dict(

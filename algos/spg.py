@@ -45,14 +45,14 @@ WORLDS = {
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, slots=10),
     ("cleaner", "adam"): dict(learning_rate=3e-4, slots=10),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, slots=10),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=10),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, slots=1),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, slots=10),
     ("gotogether", "adam"): dict(learning_rate=3e-3, slots=10),
     ("movebox", "sign"): dict(learning_rate=1e-4, slots=10),
     ("movebox", "adam"): dict(learning_rate=3e-4, slots=10),
     ("pushbox", "sign"): dict(learning_rate=1e-4, slots=10),
-    ("pushbox", "adam"): dict(learning_rate=3e-4, slots=10),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, slots=3),
 }
 # The lowest and highest value of every number that makes sense.
 LIMITS = dict(

@@ -14,8 +14,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
+import torch
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -81,6 +83,53 @@ def bonus_speed(window, visits=20_000):
     return (time.perf_counter() - start) / (visits * world.num_agents) * 1e6
 
 
+def matrix_speed(size=1024, repeats=10):
+    """Billions of arithmetic operations per second of a large single-precision matrix product: the limit of one core."""
+    matrix = torch.ones(size, size)
+    matrix @ matrix
+    start = time.perf_counter()
+    for _ in range(repeats):
+        matrix @ matrix
+    return repeats * 2 * size**3 / (time.perf_counter() - start) / 1e9
+
+
+def update_profile(method, env, num_episodes=200):
+    """Shares of a run's time that acting, the update and its backward pass take, and the update's arithmetic per second.
+
+    The update is the policies' forward and backward pass over all observations of an episode (and of the memory); for every
+    weight and observation that is 2 operations forward and 4 backward.
+    """
+    script = importlib.import_module(f"algos.{method}")
+    seconds, state = dict(acting=0.0, forward=0.0, backward=0.0), dict(collecting=False, operations=0)
+    collect, act, grad = script.collect, script.StackedMLP.__call__, torch.autograd.grad
+
+    def timed(what, function, *args):
+        start = time.perf_counter()
+        result = function(*args)
+        seconds[what] += time.perf_counter() - start
+        return result
+
+    def watched_collect(*args):
+        state["collecting"] = True
+        collect(*args)
+        state["collecting"] = False
+
+    def watched_act(self, x):
+        if not state["collecting"]:
+            state["operations"] += 6 * x.shape[1] * sum(param.numel() for param in self.params)
+        return timed("acting" if state["collecting"] else "forward", act, self, x)
+
+    with (
+        patch.object(script, "collect", watched_collect),
+        patch.object(script.StackedMLP, "__call__", watched_act),
+        patch.object(torch.autograd, "grad", lambda *args: timed("backward", grad, *args)),
+    ):
+        total, _ = script_speed(method, env, 20, num_episodes)
+    update = seconds["forward"] + seconds["backward"]
+    shares = [f"{part / total:.0%}" for part in (seconds["acting"], seconds["forward"], seconds["backward"])]
+    return [*shares, f"{state['operations'] / update / 1e9:.0f}"]
+
+
 def startup_seconds(method):
     """Seconds of a whole run of two episodes with warm caches: what a user waits before training begins."""
     with tempfile.TemporaryDirectory() as folder:
@@ -116,6 +165,9 @@ def main(quick: bool = False):
     print_table("The exploration bonus:", ["window m", "microseconds per visit"], [[m, f"{visit[m]:.1f}"] for m in visit])
     shares = [[env, f"{rates['decespg', env] * 2 * visit[50] / 1e6:.0%}"] for env in EPISODES]  # two agents remember each step
     print_table("Its share of DecESPG's time at 20 trials:", ["world", "share"], shares)
+    rows = [[method, env, *update_profile(method, env)] for method in ("pg", "decespg") for env in ("cleaner", "movebox")]
+    head = ["script", "world", "acting", "forward", "backward", "update, GFLOP/s"]
+    print_table(f"The 256-128 networks (a large matrix product: {matrix_speed():.0f} GFLOP/s):", head, rows)
     rows = [[method, f"{startup_seconds(method):.1f}"] for method in METHODS]
     print_table("Start-up, with two episodes:", ["script", "seconds"], rows)
 

@@ -30,19 +30,19 @@ import envs
 
 # A quarter of Table 1.
 EPISODES = {"findtreasure": 2500, "pushbox": 5000, "gotogether": 2500, "cleaner": 5000, "movebox": 5000}
-# These worlds take the best learning rate of the world whose networks are of the same or nearest size.
-NEAREST = {"gotogether": "findtreasure", "cleaner": "pushbox", "movebox": "pushbox"}
+# These worlds take the best learning rate of the world whose networks are of the same size.
+SAME_SIZE = {"gotogether": "findtreasure", "cleaner": "movebox"}
 LEARNING_RATES = {"sign": (1e-4, 3e-4, 1e-3), "adam": (3e-4, 1e-3, 3e-3)}
 BETAS = {
     "findtreasure": (0.03, 0.1, 0.3),
     "pushbox": (1.0, 3.0, 10.0),
     "gotogether": (0.03, 0.1, 0.3),
     "cleaner": (0.01, 0.03, 0.1),
-    "movebox": (0.3, 1.0, 3.0),
+    "movebox": (0.03, 0.1, 0.3),
 }
-# The number of a method's own that is tuned, and its values in each world; pg has none.
+# The number of a method's own that is tuned, and its values in each world; pg has none, and so nothing to tune in SAME_SIZE.
 OWN = {
-    "pg": ("", dict.fromkeys(EPISODES, (None,))),
+    "pg": ("", {world: (None,) for world in EPISODES if world not in SAME_SIZE}),
     "epg": ("beta", BETAS),
     "spg": ("slots", dict.fromkeys(EPISODES, (1, 3, 10))),
     "espg": ("beta", BETAS),
@@ -95,16 +95,17 @@ class Table:
 
     def cells(self, world, optimizer):
         """The grid of one world and optimiser."""
-        rates = LEARNING_RATES[optimizer]
-        if world in NEAREST:
-            rates = [self.best(NEAREST[world], optimizer).learning_rate]
-        return [Cell(self.method, world, optimizer, *cell) for cell in product(rates, OWN[self.method][1][world])]
+        values, rates = OWN[self.method][1].get(world, ()), LEARNING_RATES[optimizer]
+        if values and world in SAME_SIZE:
+            rates = [self.best(SAME_SIZE[world], optimizer).learning_rate]
+        return [Cell(self.method, world, optimizer, *cell) for cell in product(rates, values)]
 
     def finished(self, world, optimizer):
-        """Whether all cells of a world and optimiser have a row."""
-        if world in NEAREST and not self.finished(NEAREST[world], optimizer):
+        """Whether all cells of a world and optimiser, of which there are some, have a row."""
+        if world in SAME_SIZE and not self.finished(SAME_SIZE[world], optimizer):
             return False
-        return all(cell.key in self.rows for cell in self.cells(world, optimizer))
+        cells = self.cells(world, optimizer)
+        return bool(cells) and all(cell.key in self.rows for cell in cells)
 
     def best(self, world, optimizer):
         """The cell that the rule chooses, out of finished ones."""
@@ -165,13 +166,13 @@ def main(
             print(f"tune.py: there is no {what} {word!r}; there is {', '.join(known)}.", file=sys.stderr)
             sys.exit(2)
     tables = {method: Table(method) for method in methods}
-    needed = [NEAREST.get(world, world) for world in worlds]
-    for stage in ([w for w in EPISODES if w in needed], [w for w in NEAREST if w in worlds]):  # the second needs the first
+    needed = [SAME_SIZE.get(world, world) for world in worlds]
+    for stage in ([w for w in EPISODES if w in needed], [w for w in SAME_SIZE if w in worlds]):  # the second needs the first
         cells = [cell for group in product(methods, stage, optimizers) for cell in tables[group[0]].cells(*group[1:])]
         run_cells(tables, [cell for cell in cells if cell.key not in tables[cell.method].rows], jobs)
     for method in methods:
         print(tables[method].path.relative_to(ROOT))
-        for pair in product(worlds, optimizers):
+        for pair in filter(lambda pair: tables[method].finished(*pair), product(worlds, optimizers)):
             print("  ", *pair, tables[method].best(*pair).key[2:], *tables[method].rows[tables[method].best(*pair).key])
 
 
