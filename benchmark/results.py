@@ -127,6 +127,7 @@ def draw_figure(name, methods, results):
     for row, optimizer in enumerate(OPTIMIZERS):
         for column, world in enumerate(worlds):
             axis = axes[row, column]
+            axis.set_visible(any((world, method, optimizer) in results for method in methods))
             for method in methods:
                 if (result := results.get((world, method, optimizer))) is not None:
                     mean, error = mean_and_error(result.score)
@@ -158,7 +159,8 @@ def score_table(results):
                 lengths = {str(result.num_episodes) for result in found if result}
                 words = [world, METHODS[method], ", ".join(sorted(lengths))]
                 lines.append(words + [word for result in found for word in scores(world, result)])
-        lines.append([world, "*exact optimum*", "", f"*{optimum(world):.2f}*", "", "", f"*{optimum(world):.2f}*", "", ""])
+        if lines[-1][0] == world:
+            lines.append([world, "*exact optimum*", "", f"*{optimum(world):.2f}*", "", "", f"*{optimum(world):.2f}*", "", ""])
     return markdown(lines)
 
 
