@@ -371,7 +371,7 @@ def visit_counts(pairs, lengths, rings, inverses, visits, sigma, noise):
 
 
 class VisitNovelty:
-    """The exploration bonus of Section 3.1: windows over the last m visits, and a Gaussian process over each."""
+    """The exploration bonus of Section 3.1: windows of the last m pairs u = (o, a), and a Gaussian process over each."""
 
     def __init__(self, num_trials, num_windows, pair_dim, window, sigma, noise):
         self.pairs = np.zeros((num_trials, num_windows, pair_dim, window))
@@ -477,7 +477,7 @@ def train(args: Args):
         reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
 
         # Augment each agent's reward with its own exploration bonus, Eq. 9, and remember the visits.
-        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)
+        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
         bonus, unvisited, overvisited = novelty.bonus(pairs, lengths)
         augmented = reward + args.beta * bonus
 

@@ -4,6 +4,9 @@ The team remembers its last m joint pairs u = (o_1, a_1, .., o_n, a_n). A Gaussi
 visited, eta(u) in (0, 1] (Eqs. 5-7), and the reward of all agents becomes r' = r + beta EB(u) with EB(u) = -log eta(u)
 (Eqs. 8-9); Eq. 14 climbs along it.
 
+Where all agents observe the same positions (all worlds but pushbox), u holds these n times, so that a squared distance counts n
+times and the kernel is as narrow as decespg.py's with sigma / sqrt(n). That is left so: sigma is the width of Eq. 5 in u.
+
 Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021).
 
     python algos/epg.py --env pushbox --seed 3
@@ -368,7 +371,7 @@ def visit_counts(pairs, lengths, rings, inverses, visits, sigma, noise):
 
 
 class VisitNovelty:
-    """The exploration bonus of Section 3.1: windows over the last m visits, and a Gaussian process over each."""
+    """The exploration bonus of Section 3.1: windows of the last m pairs u = (o, a), and a Gaussian process over each."""
 
     def __init__(self, num_trials, num_windows, pair_dim, window, sigma, noise):
         self.pairs = np.zeros((num_trials, num_windows, pair_dim, window))
@@ -414,9 +417,9 @@ def train(args: Args):
         lengths, longest = rollout.lengths, rollout.lengths.max()
         reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
 
-        # Augment the reward with the joint pair's exploration bonus, Eq. 9, the same for all agents, and remember the visits.
-        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)
-        pairs = pairs.reshape(longest, args.num_trials, 1, pair_dim)
+        # Augment the reward with the team's exploration bonus, Eq. 9, the same for all agents, and remember the visits.
+        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
+        pairs = pairs.reshape(longest, args.num_trials, 1, pair_dim)  # the team's u
         bonus, unvisited, overvisited = novelty.bonus(pairs, lengths)
         augmented = reward + args.beta * bonus
 

@@ -9,6 +9,10 @@ from functools import cache
 import numpy as np
 from numba import njit
 
+# How the functions of a world are compiled: as by `njit(cache=True)`, but without numba's counting of references to arrays,
+# which would take a third to half of the time of a step. So they cannot make arrays, only read and write those they are given.
+rule = njit(cache=True, _nrt=False)
+
 
 class UsageError(ValueError):
     """Something that was asked for is impossible; the message is one sentence that says what would be accepted."""
@@ -20,7 +24,7 @@ class World:
     `step(rules, state, actions) -> (reward, outcome)` changes `state` [state_dim] (int64) by the joint action [num_agents]
     and returns the team's reward and the outcome (0: still running, k: ended as `outcome_names[k - 1]`).
     `observe(rules, cell, state, obs)` writes what the agents see into `obs` [num_agents, obs_dim] (float32).
-    Both are compiled by numba and take `rules` as the world built it: an array or a record of the world's numbers.
+    Both are compiled by `rule` and take `rules` as the world built it: an array or a record of the world's numbers.
     """
 
     name: str
@@ -84,7 +88,7 @@ def check_choice(option, value, choices):
     return value
 
 
-@njit(cache=True)
+@rule
 def observe_positions(rules, cell, state, obs):
     """Every agent sees the first obs_dim entries of the state: the positions of all agents (and the box), in map widths."""
     for i in range(obs.shape[0]):
@@ -92,7 +96,7 @@ def observe_positions(rules, cell, state, obs):
             obs[i, j] = state[j] * cell
 
 
-@njit(cache=True)
+@rule
 def observe_own(rules, cell, state, obs):
     """Every agent sees only its own row and column, in map widths."""
     for i in range(obs.shape[0]):
@@ -136,10 +140,11 @@ def compile_batch(step, observe):
     They enclose `step` and `observe` and are compiled anew in every process (about half a second): numba's cache on disk would
     save them together with the rules that they were first compiled for, and an edited world would silently keep its old rules.
     They take the worlds' `memory` [num_envs, 2 + state_dim]: each one's outcome, number of steps and state. One call with few
-    arguments does everything, because for a small batch most of the time goes into calling and making arrays.
+    arguments does everything, because for a small batch most of the time goes into calling and making arrays. They count no
+    references either, see `rule`.
     """
 
-    @njit
+    @njit(_nrt=False)
     def look(rules, cell, local_index, state_scale, memory, obs, global_state, local_state):
         """Write what is to be seen of the worlds: observations, global states, and the agents' own entries."""
         for e in range(len(memory)):
@@ -151,7 +156,7 @@ def compile_batch(step, observe):
                 for j in range(local_index.shape[1]):
                     local_state[e, i, j] = state[local_index[i, j]]
 
-    @njit
+    @njit(_nrt=False)
     def advance(
         rules, cell, local_index, state_scale, memory, num_actions, max_steps, actions,
         reward, terminated, truncated, outcome, obs, global_state, local_state,

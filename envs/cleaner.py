@@ -29,9 +29,8 @@ Source        the published env_Cleaner, whose maze is drawn at random; the one 
 """
 
 import numpy as np
-from numba import njit
 
-from envs.base import PositionWorld, UsageError, check_whole
+from envs.base import PositionWorld, UsageError, check_whole, rule
 
 MAZE = (
     *("#############", "#...#.......#", "#.#.###.###.#", "#.#.#...#...#", "###.###.#.###", "#.......#...#", "#.#.#.#######"),
@@ -42,7 +41,7 @@ UP, DOWN, LEFT, RIGHT = range(4)
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # rows and columns that these lead on
 
 
-@njit(cache=True)
+@rule
 def step(places, state, actions):
     """Rules of one step; state = [row 0, column 0, row 1, ..., then 1 for every dirty and 0 for every clean cell].
 

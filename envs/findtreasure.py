@@ -23,16 +23,15 @@ Source        the map, the rules and the bump's cost are the authors' published 
 """
 
 import numpy as np
-from numba import njit
 
-from envs.base import PositionWorld, UsageError, check_whole
+from envs.base import PositionWorld, UsageError, check_whole, rule
 
 UP, DOWN, LEFT, RIGHT, WAIT = range(5)
 FREE, WALL, DOOR, LEVER, MEETING, TREASURE = range(6)
 TREASURE_REWARD, MEETING_REWARD, BUMP_REWARD = 100.0, 3.0, -0.1
 
 
-@njit(cache=True)
+@rule
 def step(grid, state, actions):
     """Rules of one step; state = [row 0, column 0, row 1, column 1], grid [size, size] holds what is in each cell."""
     door_open = grid[state[0], state[1]] == LEVER or grid[state[2], state[3]] == LEVER

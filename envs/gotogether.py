@@ -22,9 +22,8 @@ Source        the map and the rules are the authors' published env_GoTogether; r
 """
 
 import numpy as np
-from numba import njit
 
-from envs.base import PositionWorld, check_whole
+from envs.base import PositionWorld, check_whole, rule
 
 FREE, WALL, GOAL = range(3)
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -32,7 +31,7 @@ GOAL_REWARD, DISTANCE_REWARD = 10.0, -0.5
 TOO_CLOSE, FARTHEST = 1, 9  # squared distances
 
 
-@njit(cache=True)
+@rule
 def step(grid, state, actions):
     """Rules of one step; state = [row 0, column 0, row 1, column 1], grid [size, size] holds what is in each cell."""
     for i in range(2):

@@ -31,9 +31,8 @@ Source        the map and the rules are the authors' published env_MoveBox; rewa
 """
 
 import numpy as np
-from numba import njit
 
-from envs.base import PositionWorld
+from envs.base import PositionWorld, rule
 
 MAP = (
     *("###############", "######fff######"),
@@ -49,19 +48,19 @@ FAR_REWARD, NEAR_REWARD = 100.0, 10.0
 BOX_ROW, BOX_COLUMN = 4, 5  # state = [row 0, column 0, row 1, column 1, row of the box, column of the box]
 
 
-@njit(cache=True)
+@rule
 def direction(action):
     """How many rows and columns an action leads on."""
     return (action == DOWN) - (action == UP), (action == RIGHT) - (action == LEFT)
 
 
-@njit(cache=True)
+@rule
 def holds_box(state, i):
     """Whether agent i stands left or right of the box: then it holds it, and keeps standing there."""
     return state[2 * i] == state[BOX_ROW] and abs(state[2 * i + 1] - state[BOX_COLUMN]) == 1
 
 
-@njit(cache=True)
+@rule
 def step(grid, state, actions):
     """Rules of one step; grid [15, 15] holds what is in each cell."""
     if holds_box(state, 0) and holds_box(state, 1):

@@ -27,9 +27,8 @@ Source        yuchen-x/MacDeepMARL, box_pushing (the paper's [36]), whose penalt
 """
 
 import numpy as np
-from numba import njit
 
-from envs.base import World, check_choice, check_number
+from envs.base import World, check_choice, check_number, rule
 
 NORTH, EAST, SOUTH, WEST = range(4)
 FORWARD, TURN_LEFT, TURN_RIGHT, WAIT = range(4)
@@ -45,14 +44,14 @@ RULES = np.dtype(
 LEFT_Y, RIGHT_Y, LARGE_Y = 6, 7, 8
 
 
-@njit(cache=True)
+@rule
 def in_front(state, i):
     """The cell (x, y) that agent i faces."""
     x, y, facing = state[3 * i], state[3 * i + 1], state[3 * i + 2]
     return x + (facing == EAST) - (facing == WEST), y + (facing == NORTH) - (facing == SOUTH)
 
 
-@njit(cache=True)
+@rule
 def content(room, state, x, y):
     """What is in cell (x, y), teammates aside."""
     if not (0 <= x < room.size and 0 <= y < room.size):
@@ -64,14 +63,14 @@ def content(room, state, x, y):
     return EMPTY
 
 
-@njit(cache=True)
+@rule
 def below_large(room, state, i):
     """Whether agent i stands below the large box and faces it."""
     x, y = in_front(state, i)
     return state[3 * i + 2] == NORTH and content(room, state, x, y) == LARGE_BOX
 
 
-@njit(cache=True)
+@rule
 def step(rules, state, actions):
     """Rules of one step."""
     room = rules[0]
@@ -112,7 +111,7 @@ def step(rules, state, actions):
     return reward + SMALL_REWARD * (left + right), left + 2 * right
 
 
-@njit(cache=True)
+@rule
 def observe(rules, cell, state, obs):
     """What each agent faces, one-hot; a teammate in a box's cell (possible for n >= 6) is seen beside the box."""
     obs[:] = 0.0

@@ -63,10 +63,9 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         actions = np.asarray(actions)
         if actions.shape != self._actions_shape or actions.dtype.kind not in "iu":
             raise ValueError(f"actions must be whole numbers of shape {self._actions_shape}.")
-        results = next(self._spare, None) or self._make_spare()
-        if not self._advance(actions, *results):
+        reward, terminated, truncated, outcome, obs, state, local_state = next(self._spare, None) or self._make_spare()
+        if not self._advance(actions, reward, terminated, truncated, outcome, obs, state, local_state):
             raise ValueError(f"actions must be between 0 and {self.world.num_actions - 1}.")
-        reward, terminated, truncated, outcome, obs, state, local_state = results
         return obs, reward, terminated, truncated, {"outcome": outcome, "state": state, "local_state": local_state}
 
     def _make_spare(self):
