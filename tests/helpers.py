@@ -4,6 +4,7 @@ import copy
 import importlib
 import itertools
 import json
+from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -124,6 +125,23 @@ def script(name):
     return importlib.import_module(f"algos.{name}")
 
 
+def optimizers(name):
+    """What --optimizer may be, as arguments of `train`; a script without policies has no such option."""
+    has_policies = "optimizer" in [field.name for field in fields(script(name).Args)]
+    return [dict(optimizer=optimizer) for optimizer in ("sign", "adam")] if has_policies else [{}]
+
+
+each_script_and_setting = pytest.mark.parametrize(
+    ("name", "setting"),
+    [
+        pytest.param(name, dict(env=env, **choice), id="-".join([name, env, *choice.values()]))
+        for name in SCRIPTS
+        for env in ("findtreasure", "pushbox")
+        for choice in optimizers(name)
+    ],
+)
+
+
 def train(module, run_dir, **args):
     """What a script's `train` returns; `args` are those that are not the default."""
     return module.train(module.Args(run_dir=run_dir, **args))
@@ -223,20 +241,15 @@ def memory_steps(episodes, i):
 
 def use_double_precision(module, monkeypatch):
     """Let the networks of a script calculate in double precision, in which rounding does not grow into sight."""
+    network = module.StackedMLP  # whatever is made of it, such as another Policy, changes with it
+    init, call = network.__init__, network.__call__
 
-    def doubled(network):
-        class DoubleMLP(network):
-            def __init__(self, *args):
-                super().__init__(*args)
-                self.params = [param.detach().double().requires_grad_() for param in self.params]
+    def init_in_double(self, *args):
+        init(self, *args)
+        self.params = [param.detach().double().requires_grad_() for param in self.params]
 
-            def __call__(self, x):
-                return super().__call__(x.double())
-
-        return DoubleMLP
-
-    for name in ("StackedMLP", "Policy"):
-        monkeypatch.setattr(module, name, doubled(getattr(module, name)))
+    monkeypatch.setattr(network, "__init__", init_in_double)
+    monkeypatch.setattr(network, "__call__", lambda self, x: call(self, x.double()))
 
 
 def assert_same_episodes(some, others):

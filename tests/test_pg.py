@@ -204,16 +204,16 @@ def test_initial_weights_are_uniform_and_come_from_the_trials_own_generator():
 
 @pytest.mark.parametrize("name", SCRIPTS)
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
-def test_all_scripts_start_from_the_same_actors_and_play_the_same_first_episode(name, env, tmp_path):
-    found, expected = (
-        train(module, tmp_path / which, env=env, seed=3, num_trials=2, num_episodes=3, learning_rate=0.0)
-        for which, module in (("found", script(name)), ("expected", pg))
-    )
+def test_all_scripts_start_from_the_same_actors_and_play_the_same_first_episodes(name, env, tmp_path):
+    args = dict(env=env, seed=3, num_trials=2, num_episodes=3, learning_rate=0.0)
+    found = train(script(name), tmp_path / "found", **args)
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (3, 4)]
     sizes = [found.log.world.obs_dim, *pg.WORLDS[env]["hidden"], found.log.world.num_actions]
     assert all(map(torch.equal, weights(found.policy), weights(pg.StackedMLP(fresh, 2, sizes))))
-    assert np.array_equal(found.log.returns, expected.log.returns)
-    assert np.array_equal(found.log.lengths, expected.log.lengths)
+    if script(name).Policy is script(name).StackedMLP:  # not where the networks' outputs are values, which play otherwise
+        expected = train(pg, tmp_path / "expected", **args)
+        assert np.array_equal(found.log.returns, expected.log.returns)
+        assert np.array_equal(found.log.lengths, expected.log.lengths)
 
 
 def test_sign_descent_is_the_first_step_of_a_fresh_adam():
