@@ -24,6 +24,11 @@ METHODS = {
     "spg": "SPG",
     "espg": "ESPG",
     "decespg": "DecESPG",
+    "ac": "AC",
+    "coma": "COMA",
+    "acer": "ACER",
+    "dqn": "DQN",
+    "edti": "EDTI",
 }
 
 

@@ -28,8 +28,14 @@ STORE = ROOT / "benchmark" / "results"
 README = ROOT / "README.md"
 BLOCK = 100  # episodes of which a point of a curve is the mean
 # The colours of Okabe and Ito, which the colour-blind can tell apart; the same in all figures.
-COLOURS = {"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"}
-FIGURES = {"figure4": ("pg", "epg", "spg", "espg", "decespg")}
+COLOURS = {
+    **{"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"},
+    **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#f0e442", "dqn": "#000000", "edti": "#882255"},
+}
+FIGURES = {
+    "figure3": ("pg", "ac", "coma", "acer", "dqn", "edti", "decespg"),
+    "figure4": ("pg", "epg", "spg", "espg", "decespg"),
+}
 
 
 @dataclass(frozen=True)
@@ -207,6 +213,8 @@ def main(runs: Path = RUNS):
     take_in(runs)
     results = kept()
     for name, methods in FIGURES.items():
+        if not any(method in methods[1:-1] for _, method, _ in results):
+            continue  # only what every figure shows
         draw_figure(name, methods, results)
     readme = rewrite(README.read_text(), "scores", score_table(results))
     README.write_text(rewrite(readme, "differences", difference_table(results)))

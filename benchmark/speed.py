@@ -1,6 +1,7 @@
 """Speed on one core: the worlds, the scripts at 1 and 20 trials, the exploration bonus, and start-up.
 
-    python benchmark/speed.py                            # everything, some minutes; --quick for a tenth of the episodes
+    python benchmark/speed.py                            # some minutes; --quick for a tenth of the episodes
+    python benchmark/speed.py pg decespg ac coma         # other scripts beside these two
 
 Prints tables of figures and of their ratios, all from this one run; run it on an otherwise idle machine.
 """
@@ -14,6 +15,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Annotated
 from unittest.mock import patch
 
 import numpy as np
@@ -24,7 +26,6 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
 
-METHODS = ("pg", "decespg")
 EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
 
 
@@ -139,18 +140,22 @@ def startup_seconds(method):
         return time.perf_counter() - start
 
 
-def main(quick: bool = False):
+def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "decespg"), quick: bool = False):
     """Measure and print.
 
     Args:
+        methods: scripts of algos/ without .py, pg and decespg among them
         quick: train for a tenth of Table 1's episodes
     """
+    if not {"pg", "decespg"} <= set(methods) <= {path.stem for path in (ROOT / "algos").glob("*.py")}:
+        print("speed.py: the methods must be scripts of algos/ without .py, pg and decespg among them.", file=sys.stderr)
+        sys.exit(2)
     copies = (1, 20, 200)
     rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
     print_table("Million environment steps per second:", ["copies of", *copies], rows)
 
     rows, seconds, rates = [], {}, {}
-    for method in METHODS:
+    for method in methods:
         for env, episodes in EPISODES.items():
             episodes //= 10 if quick else 1
             one, one_rate = script_speed(method, env, 1, episodes)
@@ -168,7 +173,7 @@ def main(quick: bool = False):
     rows = [[method, env, *update_profile(method, env)] for method in ("pg", "decespg") for env in ("cleaner", "movebox")]
     head = ["script", "world", "acting", "forward", "backward", "update, GFLOP/s"]
     print_table(f"The 256-128 networks (a large matrix product: {matrix_speed():.0f} GFLOP/s):", head, rows)
-    rows = [[method, f"{startup_seconds(method):.1f}"] for method in METHODS]
+    rows = [[method, f"{startup_seconds(method):.1f}"] for method in methods]
     print_table("Start-up, with two episodes:", ["script", "seconds"], rows)
 
 

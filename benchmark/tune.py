@@ -24,9 +24,9 @@ import numpy as np
 import tyro
 from tqdm import tqdm
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
+from benchmark.cells import ROOT, has_policies
 
 # A quarter of Table 1.
 EPISODES = {"findtreasure": 2500, "pushbox": 5000, "gotogether": 2500, "cleaner": 5000, "movebox": 5000}
@@ -47,6 +47,11 @@ OWN = {
     "spg": ("slots", dict.fromkeys(EPISODES, (1, 3, 10))),
     "espg": ("beta", BETAS),
     "decespg": ("beta", BETAS),
+    "ac": ("critic_learning_rate", dict.fromkeys(EPISODES, (1e-3, 3e-3, 1e-2))),
+    "coma": ("critic_learning_rate", dict.fromkeys(EPISODES, (1e-3, 3e-3, 1e-2))),
+    "acer": ("critic_learning_rate", dict.fromkeys(EPISODES, (3e-4, 1e-3, 3e-3))),
+    "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
+    "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
 }
 COLUMNS = ("world", "optimizer", "learning_rate", "own", "last 5 %", "worst trial", "all episodes", "chosen")
 
@@ -71,7 +76,8 @@ class Cell:
         own, _ = OWN[self.method]
         run_dir = ROOT / "runs" / "tuning" / self.method / "-".join(word for word in self.key if word)
         command = [sys.executable, ROOT / "algos" / f"{self.method}.py", "--env", self.world, "--seed", 1000, "--num-trials", 5]
-        command += ["--num-episodes", EPISODES[self.world], "--optimizer", self.optimizer, "--run-dir", run_dir]
+        command += ["--num-episodes", EPISODES[self.world], "--run-dir", run_dir]
+        command += ["--optimizer", self.optimizer] if has_policies(self.method) else []
         command += ["--learning-rate", self.learning_rate, *([f"--{own.replace('_', '-')}", self.value] if own else [])]
         if not (run_dir / "episodes.npz").exists():
             command += ["--resume"] if (run_dir / "checkpoint.pt").exists() else []
@@ -96,6 +102,8 @@ class Table:
     def cells(self, world, optimizer):
         """The grid of one world and optimiser."""
         values, rates = OWN[self.method][1].get(world, ()), LEARNING_RATES[optimizer]
+        if optimizer == "sign" and not has_policies(self.method):
+            return []
         if values and world in SAME_SIZE:
             rates = [self.best(SAME_SIZE[world], optimizer).learning_rate]
         return [Cell(self.method, world, optimizer, *cell) for cell in product(rates, values)]

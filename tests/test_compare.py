@@ -36,7 +36,7 @@ def cells(runs):
     return select(["pg", "decespg"], ["findtreasure"], ["sign"], **BLOCK, runs=Path(runs))
 
 
-def wait_for_episode(cell, episode, seconds=60):
+def wait_for_episode(cell, episode, seconds=300):
     """Wait until a cell's progress bar has passed an episode."""
     deadline = time.monotonic() + seconds
     while compare.progress(cell) < episode:
@@ -58,7 +58,7 @@ def episodes(cell):
 def test_killed_scripts_and_runners_lose_nothing(tmp_path):
     expected = {}
     whole = start(tmp_path / "whole")
-    assert whole.wait(120) == 0, whole.communicate()
+    assert whole.wait(300) == 0, whole.communicate()
     for cell in cells(tmp_path / "whole"):
         assert cell.finished
         expected[cell.method] = episodes(cell)
@@ -69,7 +69,7 @@ def test_killed_scripts_and_runners_lose_nothing(tmp_path):
     first = start(runs)
     wait_for_episode(decespg, 20)
     os.kill(process_of(decespg), signal.SIGKILL)
-    said, _ = first.communicate(timeout=120)
+    said, _ = first.communicate(timeout=300)
     assert first.returncode == 1
     assert "1 finished, 1 failed, 0 skipped" in said
     assert f"{decespg.name}: code -9" in said
@@ -93,7 +93,7 @@ def test_killed_scripts_and_runners_lose_nothing(tmp_path):
     third.wait(60)
     assert compare.state(decespg) == "running"
     last = start(runs)
-    said, _ = last.communicate(timeout=120)
+    said, _ = last.communicate(timeout=300)
     assert (last.returncode, "0 failed" in said, "0 not finished" in said) == (0, True, True), said
     assert decespg.log.read_text().count("usual end") == 1
     assert (pg.run_dir / "episodes.npz").stat().st_mtime_ns == finished_at
@@ -107,12 +107,12 @@ def test_a_polite_stop_leaves_checkpoints(tmp_path):
     runner = start(tmp_path)
     wait_for_episode(decespg, 5)
     runner.send_signal(signal.SIGTERM)
-    said, _ = runner.communicate(timeout=60)
+    said, _ = runner.communicate(timeout=300)
     assert runner.returncode == 143
     assert "0 failed" in said
     assert compare.state(decespg) == "stopped"
     assert re.search(
-        r"findtreasure/decespg/\S+ +stopped +\d+ of 1500 episodes", start(tmp_path, "--status").communicate(timeout=60)[0]
+        r"findtreasure/decespg/\S+ +stopped +\d+ of 1500 episodes", start(tmp_path, "--status").communicate(timeout=300)[0]
     )
 
 
