@@ -336,9 +336,9 @@ def distinct_observations(obs, lengths):
     return distinct[:, :most].copy(), rows
 
 
-def probabilities(log_probs):
-    """exp(log_probs) in double precision; at least 1e-8, because the equations divide by them."""
-    return log_probs.detach().exp().clamp(min=1e-8).double().numpy()
+def probabilities(logits):
+    """softmax(logits) in double precision; at least 1e-8, because the equations divide by it."""
+    return torch.softmax(logits.detach(), dim=-1).clamp(min=1e-8).double().numpy()
 
 
 @njit(cache=True)
@@ -384,12 +384,12 @@ def project_to_trust_region(g, pi, average, delta):
 
 @njit(cache=True)
 def output_directions(reward, actions, mu, lengths, cut, rows, pi, average, q, gamma, truncation, trust_region, entropy):
-    """Where an episode of every trial wants the networks' outputs to go.
+    """Where an episode of every trial wants the networks' outputs, logits and Q, to go.
 
     The episode is reward [T, num_trials], actions [T, num_trials, num_agents], mu [.., num_actions], lengths and cut
-    [num_trials]; where the time limit has cut it, V(o_T) stands for what would have come. The outputs are pi, average and q
-    [num_nets, U, num_actions]; rows [T + 1, num_trials, num_agents] says where those of a step are.
-    -> 1/T sum_t pi z_t for log pi (z_t for pi comes to pi z_t for log pi) and 1/T sum_t (Qret_t - Q_t) for Q, shaped as pi; Q_t
+    [num_trials]; where the time limit has cut it, V(o_T) stands for what would have come. pi, average and q [num_nets, U,
+    num_actions] are what the networks say, and rows [T + 1, num_trials, num_agents] where in that the steps are.
+    -> 1/T sum_t of pi (z_t - sum_a pi z_t), which is z_t brought from pi to the logits, and of Qret_t - Q_t, shaped as pi; Q_t
     and how often the trust region binds, means over steps and agents [num_trials].
     """
     _, trials, agents = actions.shape
@@ -412,8 +412,9 @@ def output_directions(reward, actions, mu, lengths, cut, rows, pi, average, q, g
                 for a in range(len(z)):
                     z[a] -= entropy * (np.log(probs[a]) + 1.0)
                 bound[k] += project_to_trust_region(z, probs, average[net, row[t]], trust_region) / (length * agents)
+                mean_z = (probs * z).sum()
                 for a in range(len(z)):
-                    policy_direction[net, row[t], a] += probs[a] * z[a] / length
+                    policy_direction[net, row[t], a] += probs[a] * (z[a] - mean_z) / length
                 critic_direction[net, row[t], action[t]] += (target[t] - q_taken[t]) / length
                 mean_value[k] += q_taken[t] / (length * agents)
     return policy_direction, critic_direction, mean_value, bound
@@ -447,7 +448,7 @@ def train(args: Args):
 
         # Keep it, with the probabilities of all actions.
         obs, rows = distinct_observations(rollout.obs, rollout.lengths)
-        mu = probabilities(torch.log_softmax(policy(torch.from_numpy(obs)), dim=-1))
+        mu = probabilities(policy(torch.from_numpy(obs)))
         rollout.mu = mu[nets, rows].astype(np.float32)  # [T + 1, num_trials, num_agents, num_actions]
         replay.add(episode, rollout)
 
@@ -456,14 +457,13 @@ def train(args: Args):
         for steps in (rollout, replay.read(replay.draw(episode, learn))):
             obs, rows = distinct_observations(steps.obs, steps.lengths)
             obs = torch.from_numpy(obs)
-            log_probs, q = torch.log_softmax(policy(obs), dim=-1), critic(obs)  # [num_nets, U, num_actions]
-            average_log_probs = torch.log_softmax(average(obs), dim=-1)
+            logits, q = policy(obs), critic(obs)  # [num_nets, U, num_actions]
             policy_direction, critic_direction, value, bound = output_directions(
                 *(steps.reward / REWARD_SCALE, steps.actions, steps.mu, steps.lengths, steps.outcomes == 0, rows),
-                *(probabilities(log_probs), probabilities(average_log_probs), q.detach().double().numpy()),
+                *(probabilities(logits), probabilities(average(obs)), q.detach().double().numpy()),
                 *(args.gamma, args.truncation, args.trust_region, args.entropy),
             )
-            loss = -(torch.from_numpy(policy_direction) * log_probs).sum()
+            loss = -(torch.from_numpy(policy_direction) * logits).sum()
             optimizer.step(torch.autograd.grad(loss, policy.params))
             critic_loss = -(torch.from_numpy(critic_direction) * q).sum()  # descends 1/T sum_t (Qret_t - Q_t)^2 / 2
             critic_optimizer.step(torch.autograd.grad(critic_loss, critic.params))

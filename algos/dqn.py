@@ -7,8 +7,10 @@ steps (o, a, r, o') towards
 
 (Mnih et al., "Human-level control through deep reinforcement learning", Nature 2015). All agents of a team draw the same steps,
 so that each learns beside what its teammates did then (CERT of Omidshafiei et al., "Deep Decentralized Multi-task Multi-Agent
-Reinforcement Learning under Partial Observability", ICML 2017). So does Section 4.2 of Jiang & Amato (SAC 2021), which switches
-that paper's hysteresis off and gives no numbers; `Args` says where each comes from.
+Reinforcement Learning under Partial Observability", ICML 2017). Section 4.2 of Jiang & Amato, "Multi-Agent Reinforcement
+Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), does so without hysteresis and gives no numbers.
+The time limit bootstraps, the end of the world does not. The copies Q' are timed by steps, because episodes become ten times as
+short: with one every 200 episodes, teams in findtreasure often fell back into walking in circles.
 
     python algos/dqn.py --env findtreasure --num-trials 20
 """

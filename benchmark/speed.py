@@ -31,7 +31,7 @@ EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
 
 def print_table(title, head, rows):
     """A Markdown table."""
-    print(f"\n{title}\n\n| {' | '.join(head)} |\n|{'---|' * len(head)}")
+    print(f"\n{title}\n\n| {' | '.join(map(str, head))} |\n|{'---|' * len(head)}")
     for row in rows:
         print(f"| {' | '.join(map(str, row))} |", flush=True)
 
