@@ -49,6 +49,8 @@ class Args:
     """only list the cells, their numbers and states"""
     status: bool = False
     """only show where the cells are"""
+    slurm: bool = False
+    """submit the cells that are not finished to Slurm, as one job array (benchmark/cell.sbatch)"""
     cell: int | None = None
     """run exactly the cell of this number in the selection's list: the contract for every scheduler"""
 
@@ -248,6 +250,22 @@ def show_states(cells):
         print(f"{number:>4}  {cell.name:<60} {word:<9} {detail}".rstrip())
 
 
+def submit(cells):
+    """Submit one job array over the unfinished cells; a task runs `./benchmark.sh <the same selection> --cell <its number>`."""
+    numbers = [number for number, cell in enumerate(cells) if state(cell) not in ("finished", "running")]
+    if not numbers:
+        return print("All cells are finished or running.")
+    selected = [word for word in sys.argv[1:] if word != "--slurm"]
+    (ROOT / "runs" / "slurm").mkdir(parents=True, exist_ok=True)
+    command = ["sbatch", f"--array={','.join(map(str, numbers))}", "benchmark/cell.sbatch", *selected]
+    try:
+        subprocess.run(command, cwd=ROOT, check=True)
+    except FileNotFoundError:
+        refuse("there is no sbatch on this machine; --slurm needs the commands of Slurm.")
+    except subprocess.CalledProcessError as error:
+        refuse(f"sbatch refused with code {error.returncode}; the three lines to adapt stand in benchmark/cell.sbatch.")
+
+
 def report(skipped, jobs, waiting):
     """What became of the cells; returns the exit code."""
     failed = [job for job in jobs if job.code != 0 and not job.stopped]
@@ -266,6 +284,8 @@ def main():
     cells = selection(args)
     if args.dry_run or args.status:
         return show_states(cells)
+    if args.slurm:
+        return submit(cells)
     if args.cell is not None:
         if not 0 <= args.cell < len(cells):
             refuse(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")

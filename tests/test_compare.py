@@ -243,6 +243,12 @@ def test_a_broken_result_is_said_and_run_again(tmp_path, monkeypatch, capsys):
     assert cell.finished
 
 
+def test_without_slurm_nothing_is_submitted(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    code, _, err = command(monkeypatch, capsys, *SMALL, "--slurm", "--runs", tmp_path)
+    assert (code, err) == (2, "benchmark.sh: there is no sbatch on this machine; --slurm needs the commands of Slurm.\n")
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
