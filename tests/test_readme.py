@@ -41,12 +41,14 @@ def test_the_first_command_installs_and_trains(folder):
 
 
 def test_the_example_commands_run(folder):
-    train, evaluate, other, help_text = [command for command in COMMANDS if command.startswith("python algos/")]
+    train, evaluate, other, help_text, *reported = [command for command in COMMANDS if command.startswith("python algos/")]
     policy = evaluate.split()[-1]
     assert "20 trials" in run(f"{train} --num-episodes 2 --run-dir {policy.rpartition('/')[0]}", folder)
     assert "2 episodes of 20 teams" in run(f"{evaluate} --num-episodes 2", folder)
     assert "1 trial" in run(f"{other} --num-episodes 2", folder)
     assert "--learning-rate" in run(help_text, folder)
+    for command in reported:
+        assert "usual end" in run(re.sub("--num-episodes [0-9]+", "--num-episodes 2", command), folder)
 
 
 def test_the_worked_example_replaces_the_bonus(folder):
