@@ -680,16 +680,12 @@ def play(env, policy, args, num_episodes, video):
     return log
 
 
-def evaluate(args):
-    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
-    torch.set_num_threads(1)
-    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
-    check_limits("num_episodes", num_episodes)
-    check_limits("seed", args.seed)
-    if not args.evaluate.exists():
-        raise envs.UsageError(f"there is no file {args.evaluate}.")
+def load_teams(path):
+    """The worlds and the policies of a policy.pt that --save-model wrote; UsageError for anything else."""
+    if not path.exists():
+        raise envs.UsageError(f"there is no file {path}.")
     try:
-        saved = torch.load(args.evaluate, weights_only=True)
+        saved = torch.load(path, weights_only=True)
         world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
         teams = len(saved["params"][0]) // world.num_agents
         sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
@@ -697,9 +693,19 @@ def evaluate(args):
         for param, kept in zip(policy.params, saved["params"], strict=True):
             param.data.copy_(kept)
     except Exception as error:  # whatever can be wrong with a file
-        raise envs.UsageError(f"{args.evaluate} is not a policy.pt that --save-model wrote.") from error
-    log = play(envs.GridVectorEnv(world, teams), policy, args, num_episodes, video)
-    print(f"{args.evaluate}: {num_episodes} episodes of {teams} teams, {log.summary(share=1.0)}; one of them in {video}")
+        raise envs.UsageError(f"{path} is not a policy.pt that --save-model wrote.") from error
+    return envs.GridVectorEnv(world, teams), policy
+
+
+def evaluate(args):
+    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
+    torch.set_num_threads(1)
+    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
+    check_limits("num_episodes", num_episodes)
+    check_limits("seed", args.seed)
+    env, policy = load_teams(args.evaluate)
+    log = play(env, policy, args, num_episodes, video)
+    print(f"{args.evaluate}: {num_episodes} episodes of {env.num_envs} teams, {log.summary(share=1.0)}; one of them in {video}")
 
 
 def main():
