@@ -92,7 +92,7 @@ class Cell:
     def command(self):
         """The command that runs the cell from its beginning."""
         words = [word for name, value in self.arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-        return [sys.executable, f"algos/{self.method}.py", *words, "--run-dir", str(self.run_dir)]
+        return [sys.executable, f"algos/{self.method}.py", *words, "--run-dir", str(self.run_dir), "--save-model"]
 
     @property
     def finished(self):
@@ -102,18 +102,20 @@ class Cell:
     @property
     def broken(self):
         """What is wrong with the result that is there; empty if nothing is."""
-        path = self.run_dir / "episodes.npz"
-        if not path.exists():
-            return ""
+        return self.what_is_wrong(self.run_dir) if (self.run_dir / "episodes.npz").exists() else ""
+
+    def what_is_wrong(self, run_dir):
+        """What is wrong with the result in a directory as one of this cell; empty if nothing is."""
+        path = run_dir / "episodes.npz"
         try:
             with np.load(path) as episodes:
                 shapes = {episodes[name].shape for name in ("returns", "lengths", "outcomes")}
-            found = settings_of(self.run_dir)
+            found = settings_of(run_dir)
         except Exception as error:  # whatever can be wrong with a file
             return f"{path} cannot be read ({type(error).__name__})"
         if shapes != {(self.num_trials, self.settings["num_episodes"])}:
             return f"{path} holds arrays of another shape"
-        return "" if found == self.settings else f"{self.run_dir}/args.json is from other settings"
+        return "" if found == self.settings else f"{run_dir}/args.json is from other settings"
 
 
 def settings_of(run_dir):

@@ -15,16 +15,15 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmark import results
 from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, select
-
-# Seconds that 1000 episodes of 20 trials of decespg.py took on a 3 GHz core: for the order of cells that nobody has timed.
-SECONDS = {"cleaner": 240, "findtreasure": 7, "gotogether": 250, "movebox": 300, "pushbox": 4}
 
 
 @dataclass
@@ -55,9 +54,15 @@ class Args:
     """run exactly the cell of this number in the selection's list: the contract for every scheduler"""
 
 
+@cache
+def pace():
+    """Seconds per episode of 20 trials, {(method, world): seconds}, as the kept results took."""
+    return results.seconds_per_episode(results.kept())
+
+
 def remaining_seconds(cell, done=0):
-    """A guess of how long a cell still takes after `done` episodes, from SECONDS."""
-    return SECONDS[cell.world] * (cell.settings["num_episodes"] - done) * cell.num_trials / 20_000
+    """A guess of how long a cell still takes after `done` episodes; nearly in proportion to the trials."""
+    return pace()[cell.method, cell.world] * (cell.settings["num_episodes"] - done) * cell.num_trials / 20
 
 
 def progress(cell):

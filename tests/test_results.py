@@ -1,16 +1,18 @@
-"""The kept results: what is taken in, what they say, and the tables in the README."""
+"""The kept results: what is taken in, and what is said of them."""
 
 import dataclasses
 import json
+import shutil
 
 import numpy as np
 import pytest
 
 import envs
-from benchmark import results
+from algos import pg
+from benchmark import results, statistics
 from benchmark.cells import Cell
 from benchmark.results import Result
-from tests.helpers import script
+from tests.helpers import script, train
 
 
 @pytest.fixture
@@ -24,6 +26,7 @@ def write_run(cell, runs, returns, lengths, outcomes, **changed):
     folder = runs / "a" / "b"
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / "episodes.npz", returns=returns, lengths=lengths, outcomes=outcomes)
+    (folder / "seconds").write_text("12.5\n")
     args = {**dataclasses.asdict(script(cell.method).Args()), **cell.settings, **changed}
     (folder / "args.json").write_text(json.dumps({"method": args.pop("method"), "args": args}, default=str))
     return folder
@@ -46,7 +49,7 @@ def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     assert result.at_best[4, 0] == pytest.approx((outcomes[4, :100] == best).mean(), abs=1e-6)
     assert result.last == pytest.approx(score[:, -12:].mean(1))
     assert result.usual[5] == np.bincount(outcomes[5, -12:]).argmax()
-    assert result.num_episodes == 250
+    assert (result.num_episodes, result.seconds) == (250, 12.5)
 
 
 def test_a_result_is_loaded_as_it_was_saved(tmp_path):
@@ -74,30 +77,94 @@ def test_the_longer_run_counts(tmp_path, store):
         assert Result.load(store / "pushbox" / "pg-adam.npz").num_episodes == kept
 
 
+def test_what_is_broken_is_named_and_left_out(tmp_path, store, capsys):
+    results.take_in(tmp_path / "none")
+    whole = some_run(tmp_path / "whole")[0]
+    half = tmp_path / "half"
+    shutil.copytree(whole, half)
+    (half / "episodes.npz").write_bytes(b"half")
+    results.take_in(half)
+    assert "half/episodes.npz cannot be read" in capsys.readouterr().err
+    (half / "args.json").write_text("{")
+    results.take_in(half)
+    assert "half cannot be read" in capsys.readouterr().err
+    assert not store.exists()
+    results.take_in(whole)
+    kept = store / "pushbox" / "pg-adam.npz"
+    kept.write_bytes(kept.read_bytes()[:-40])
+    assert results.kept() == {}
+    assert f"{kept} cannot be read" in capsys.readouterr().err
+    results.take_in(whole)
+    assert list(results.kept()) == [("pushbox", "pg", "adam")]
+
+
+def test_an_episode_of_the_first_team_is_kept(tmp_path):
+    args = dict(env="findtreasure", seed=1, num_trials=2, num_episodes=400, learning_rate=3e-3, save_model=True)
+    log = train(pg, tmp_path, **args).log
+    world, actions = log.world, Result.of_run(tmp_path).actions
+    assert Result.of_run(tmp_path).actions.tolist() == actions.tolist()
+    state, outcome = world.start.copy(), 0
+    for step, joint in enumerate(actions.astype(np.int64)):
+        assert outcome == 0, step
+        _, outcome = world.step(world.rules, state, joint)
+    assert outcome == log.usual_outcomes(slice(-20, None))[0] > 0
+    (tmp_path / "policy.pt").unlink()
+    assert Result.of_run(tmp_path).actions.shape == (0, 2)
+
+
+def some_result(last, **values):
+    empty = dict.fromkeys(Result.__dataclass_fields__)
+    return Result(**{**empty, "last": np.asarray(last), "seconds": float("nan"), "num_episodes": 100, "about": {}, **values})
+
+
 def test_a_difference_is_that_of_the_same_seeds():
-    def result(last):
-        return Result(None, None, np.asarray(last), None, 0, {})
-
     noise = np.random.default_rng(0).normal(size=20)
-    assert results.difference(result(noise * 100 + 2), result(noise * 100)) == "+2.00 [+2.00, +2.00]"
-    wide = results.difference(result(noise), result(np.zeros(20)))
-    mean, error = noise.mean(), noise.std(ddof=1) / np.sqrt(20)
-    low, high = (float(word.strip("[],")) for word in wide.split()[1:])
-    assert float(wide.split()[0]) == pytest.approx(mean, abs=0.01)
-    assert low == pytest.approx(mean - 1.96 * error, abs=0.15)
-    assert high == pytest.approx(mean + 1.96 * error, abs=0.15)
+    assert statistics.difference(some_result(noise * 100 + 2), some_result(noise * 100)) == pytest.approx((2, 2, 2))
+    mean, low, high = statistics.difference(some_result(noise), some_result(np.zeros(20)))
+    assert mean == noise.mean()
+    error = noise.std(ddof=1) / np.sqrt(20)
+    assert (low, high) == pytest.approx((mean - 1.96 * error, mean + 1.96 * error), abs=0.15)
 
 
-def test_tables_are_written_between_their_marks():
-    readme = "a\n<!-- scores -->\nold\n<!-- end scores -->\nb\n<!-- other -->\n<!-- end other -->"
-    once = results.rewrite(readme, "scores", "new")
-    assert once == "a\n<!-- scores -->\nnew\n<!-- end scores -->\nb\n<!-- other -->\n<!-- end other -->"
-    assert results.rewrite(once, "scores", "new") == once
+def test_scores_are_shares_of_the_optimum_where_a_method_has_all_worlds():
+    found = {("findtreasure", "pg", "sign"): some_result([1, 2]), ("pushbox", "pg", "sign"): some_result([100 / 3, 50 / 3])}
+    found["pushbox", "spg", "sign"] = some_result([1, 1])
+    shares = statistics.scores_over_worlds(found, "sign", ("findtreasure", "pushbox"))
+    assert list(shares) == ["pg"]
+    assert shares["pg"] == pytest.approx(np.array([[7 / 100, 1], [14 / 100, 0.5]]))
 
 
-def test_the_readmes_tables_are_those_of_the_kept_results():
-    kept = results.kept()
-    assert len(kept) >= 8
-    readme = results.README.read_text()
-    assert results.score_table(kept) in readme
-    assert results.difference_table(kept) in readme
+def test_interquartile_means_leave_the_outer_quarters_out():
+    scores = np.arange(40.0).reshape(20, 2)
+    scores[-1] = 1e6
+    assert statistics.interquartile_means({"pg": scores})["pg"][0] == pytest.approx(np.arange(10, 30).mean())
+
+
+def test_intervals_are_seeded_and_leave_the_global_generator_alone():
+    scores = {"pg": np.random.default_rng(1).normal(size=(20, 2)), "decespg": np.random.default_rng(2).normal(size=(20, 2))}
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    first = statistics.interquartile_means(scores, reps=50), statistics.improvements(scores, reps=50)
+    assert (statistics.interquartile_means(scores, reps=50), statistics.improvements(scores, reps=50)) == first
+    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+    for value, low, high in (*first[0].values(), *first[1].values()):
+        assert low < value < high
+
+
+def test_improvement_counts_the_pairs_that_are_better():
+    scores = {"decespg": np.array([[1.0], [3.0]]), "pg": np.array([[0.0], [2.0]]), "spg": np.array([[1.0], [1.0]])}
+    better = statistics.improvements(scores, reps=50)
+    assert {method: value for method, (value, _, _) in better.items()} == {"pg": 0.75, "spg": 0.75}
+
+
+def test_the_pace_of_what_nobody_has_timed_is_guessed_from_pg():
+    found = {
+        ("pushbox", "pg", "sign"): some_result([], seconds=100.0, num_episodes=1000),
+        ("pushbox", "pg", "adam"): some_result([], seconds=300.0, num_episodes=1000),
+        ("pushbox", "spg", "adam"): some_result([], seconds=600.0, num_episodes=1000),
+        ("movebox", "pg", "sign"): some_result([], seconds=5000.0, num_episodes=1000),
+        ("movebox", "epg", "sign"): some_result([]),
+    }
+    pace = results.seconds_per_episode(found)
+    assert pace["pg", "pushbox"] == pytest.approx(0.2)
+    assert pace["spg", "movebox"] == pytest.approx(15)
+    assert pace["epg", "movebox"] == pytest.approx(5)

@@ -1,0 +1,141 @@
+"""The figures of the comparison, each a function of the kept results that returns a matplotlib figure."""
+
+import matplotlib
+import numpy as np
+
+import envs
+from benchmark import statistics
+from benchmark.cells import METHODS, OPTIMIZERS, WORLDS
+from benchmark.results import BLOCK
+from envs.drawing import AGENTS
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+# The colours of Okabe and Ito, which the colour-blind can tell apart, with dashes where they are not enough; always the same.
+COLOURS = {
+    **{"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"},
+    **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#b3a100", "dqn": "#000000", "edti": "#882255"},
+    **{"decespg_ex2": "#009e73", "espg_icm": "#d55e00", "espg_emi": "#cc79a7", "gasil": "#e69f00"},
+}
+DASHES = {
+    "ac": "--",
+    "coma": "--",
+    "acer": "-.",
+    "dqn": "-.",
+    "edti": ":",
+    "decespg_ex2": "--",
+    "espg_icm": "-.",
+    "espg_emi": ":",
+}
+FIGURES = {
+    "figure3": ("pg", "ac", "coma", "acer", "dqn", "edti", "espg", "decespg"),
+    "figure4": ("pg", "epg", "spg", "espg", "decespg"),
+    "figure6": ("decespg_ex2", "espg_icm", "espg_emi", "gasil", "espg", "decespg"),
+}
+
+
+def panels(results, methods, ylabel, draw, worlds=WORLDS):
+    """A panel for each world and optimiser; draw(axis, world, method, result) draws one method there."""
+    worlds = [world for world in worlds if any((world, m, o) in results for m in methods for o in OPTIMIZERS)]
+    rows, columns = len(OPTIMIZERS), len(worlds)
+    figure, axes = plt.subplots(rows, columns, figsize=(3.4 * columns, 2.6 * rows), layout="constrained", squeeze=False)
+    for row, optimizer in enumerate(OPTIMIZERS):
+        for axis, world in zip(axes[row], worlds, strict=True):
+            found = {method: results[world, method, optimizer] for method in methods if (world, method, optimizer) in results}
+            axis.set_visible(bool(found))
+            for method, result in found.items():
+                draw(axis, world, method, result)
+            axis.set_title(f"{world}, {optimizer}", fontsize="medium")
+            axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+    figure.supylabel(ylabel, fontsize="medium")
+    figure.supxlabel("episode", fontsize="medium")
+    labels = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    names = [name for name in (*(METHODS[method] for method in methods), "exact optimum") if name in labels]
+    figure.legend([labels[name] for name in names], names, loc="outside right center", frameon=False)
+    return figure
+
+
+def line(axis, method, values, error=None):
+    """A curve of block means [blocks], with a band of its error."""
+    episodes, colour = (np.arange(len(values)) + 1) * BLOCK, COLOURS[method]
+    axis.plot(episodes, values, DASHES.get(method, "-"), color=colour, label=METHODS[method], linewidth=1.3)
+    if error is not None:
+        axis.fill_between(episodes, values - error, values + error, color=colour, alpha=0.2, linewidth=0)
+
+
+def learning_curves(results, methods):
+    """The paper's Figures 3, 4 and 6: mean and standard error over trials, the exact optimum as a line."""
+
+    def draw(axis, world, method, result):
+        line(axis, method, *statistics.mean_and_error(result.score))
+        axis.axhline(statistics.optimum(world), color="black", linewidth=0.8, linestyle=":", label="exact optimum")
+
+    return panels(results, methods, f"reward per step (mean of {BLOCK} episodes)", draw)
+
+
+def share_at_best(results, methods):
+    """The share of the trials that end most of 100 episodes in the best outcome."""
+
+    def draw(axis, world, method, result):
+        line(axis, method, (result.at_best > 0.5).mean(0))
+        axis.set_ylim(-0.03, 1.03)
+
+    worlds = [world for world in WORLDS if envs.make_world(world).outcome_names]
+    return panels(results, methods, "share of trials at the best outcome", draw, worlds)
+
+
+def intervals(estimates, xlabel):
+    """Points with 95 % intervals; estimates are {optimiser: {method: (value, low, high)}}."""
+    rows = max(map(len, estimates.values()))
+    size = (4.2 * len(estimates), 0.9 + 0.28 * rows)
+    figure, axes = plt.subplots(1, len(estimates), figsize=size, layout="constrained", squeeze=False, sharex=True)
+    for axis, (optimizer, found) in zip(axes[0], estimates.items(), strict=True):
+        for row, (method, (value, low, high)) in enumerate(found.items()):
+            axis.plot([low, high], [row, row], color=COLOURS[method], linewidth=6, alpha=0.4, solid_capstyle="butt")
+            axis.plot([value], [row], "|", color=COLOURS[method], markersize=11, markeredgewidth=2.5)
+        axis.set_yticks(range(len(found)), [METHODS[method] for method in found])
+        axis.invert_yaxis()
+        axis.grid(axis="x", alpha=0.3)
+        axis.set_title(optimizer, fontsize="medium")
+        axis.set_xlabel(xlabel)
+    return figure
+
+
+def episode_states(world, actions):
+    """The states [T + 1, state_dim] of an episode of joint actions [T, num_agents]."""
+    states = [world.start.copy()]
+    for joint in actions:
+        states.append(states[-1].copy())
+        world.step(world.rules, states[-1], np.asarray(joint, np.int64))
+    return states
+
+
+def trajectories(results, methods=("pg", "decespg"), optimizer="sign"):
+    """The paper's Figure 5: the ways of two methods' trained teams, on the picture of the world as it is at the end."""
+    worlds = [world for world in WORLDS if all((r := results.get((world, m, optimizer))) and len(r.actions) for m in methods)]
+    figure, axes = plt.subplots(len(methods), len(worlds), figsize=(2.6 * len(worlds), 6), layout="constrained", squeeze=False)
+    for column, name in enumerate(worlds):
+        world = envs.make_world(name)
+        for axis, method in zip(axes[:, column], methods, strict=True):
+            states = episode_states(world, results[name, method, optimizer].actions)
+            axis.imshow(envs.draw(world, states[-1], cell=24))
+            for i in range(world.num_agents):
+                draw_way(axis, [agent_places(world, state)[i] for state in states], AGENTS[i], i / world.num_agents)
+            axis.set_title(f"{name}\n{METHODS[method]}, {len(states) - 1} steps", fontsize="medium")
+            axis.set_axis_off()
+    return figure
+
+
+def agent_places(world, state):
+    """(row, column) of every agent."""
+    _, _, shapes = world.sketch(state)
+    return {shape[1]: shape[2:4] for shape in shapes if shape[0] == "agent"}
+
+
+def draw_way(axis, places, colour, shift, cell=24):
+    """One agent's way from a ring at its start; ways are drawn beside each other, `shift` in cells from the middle."""
+    rows, columns = (np.array(axis_places) for axis_places in zip(*places, strict=True))
+    x, y = ((values + 0.35 + 0.5 * shift) * cell for values in (columns, rows))
+    axis.plot(x, y, color=colour, linewidth=1.6, alpha=0.8)
+    axis.plot(x[:1], y[:1], "o", color=colour, markersize=7, markerfacecolor="white", markeredgewidth=1.6)

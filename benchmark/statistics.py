@@ -1,0 +1,69 @@
+"""What is said about results: means and errors, differences, interquartile means and probabilities of improvement."""
+
+from contextlib import contextmanager
+from functools import cache
+
+import numpy as np
+from rliable import library, metrics
+
+import envs
+from benchmark.cells import METHODS
+
+
+@cache
+def optimum(world):
+    """The best reward per step of a world."""
+    return envs.optimum(world).best_per_step.per_step
+
+
+def mean_and_error(values):
+    """Mean over trials (the first axis) and its standard error."""
+    return values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values))
+
+
+def difference(some, others, resamples=10_000):
+    """Mean difference of two methods' last 5 % and its 95 % bootstrap interval: mean, low, high.
+
+    Trials of the same seed start from the same networks and action draws, so the pairs are resampled.
+    """
+    differences = some.last - others.last
+    draws = np.random.default_rng(0).integers(0, len(differences), (resamples, len(differences)))
+    return differences.mean(), *np.quantile(differences[draws].mean(1), (0.025, 0.975))
+
+
+def scores_over_worlds(results, optimizer, worlds):
+    """{method: last 5 % as a share of the optimum [num_trials, worlds]} of the methods that have a result in all `worlds`."""
+    found = {}
+    for method in METHODS:
+        runs = [results.get((world, method, optimizer)) for world in worlds]
+        if all(runs):
+            found[method] = np.stack([run.last / optimum(world) for run, world in zip(runs, worlds, strict=True)], axis=1)
+    return found
+
+
+@contextmanager
+def seeded(seed=0):
+    """rliable draws from numpy's global generator, whatever random_state it is given: seed that, and put it back afterwards."""
+    state = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(state)  # noqa: NPY002
+
+
+def interquartile_means(scores, reps=1000):
+    """{method: (interquartile mean, low, high)}, 95 % by stratified bootstrap (Agarwal et al., NeurIPS 2021)."""
+    with seeded():
+        means, bounds = library.get_interval_estimates(scores, lambda x: np.array([metrics.aggregate_iqm(x)]), reps=reps)
+    return {method: (means[method][0], *bounds[method][:, 0]) for method in scores}
+
+
+def improvements(scores, over="decespg", reps=1000):
+    """{method: (probability that a trial of `over` is better than one of the method, low, high)}, ties counting half."""
+    pairs = {method: (scores[over], others) for method, others in scores.items() if method != over}
+    with seeded():
+        means, bounds = library.get_interval_estimates(
+            pairs, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=reps
+        )
+    return {method: (means[method][0], *bounds[method][:, 0]) for method in pairs}
