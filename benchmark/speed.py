@@ -3,7 +3,8 @@
     python benchmark/speed.py                            # some minutes; --quick for a tenth of the episodes
     python benchmark/speed.py pg decespg ac coma         # other scripts beside these two
 
-Prints tables of figures and of their ratios, all from this one run; run it on an otherwise idle machine.
+Prints tables of figures and of their ratios, all from this one run. Seconds are those of the processor (of the clock for the
+start-up only), so that other programs disturb little; run it on an otherwise idle machine all the same.
 """
 
 import contextlib
@@ -43,13 +44,13 @@ def world_speed(name, num_envs, seconds=1.0):
     actions = rng.integers(0, env.world.num_actions, (env.world.max_steps, num_envs, env.world.num_agents))
     env.reset()
     env.step(actions[0])
-    steps, start = 0, time.perf_counter()
-    while time.perf_counter() - start < seconds:
+    steps, start = 0, time.process_time()
+    while time.process_time() - start < seconds:
         env.reset()
         for joint in actions:
             env.step(joint)
         steps += len(actions) * num_envs
-    return steps / (time.perf_counter() - start)
+    return steps / (time.process_time() - start)
 
 
 def script_speed(method, env, num_trials, num_episodes):
@@ -59,9 +60,9 @@ def script_speed(method, env, num_trials, num_episodes):
         args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up")
         script.train(args)
         args = dataclasses.replace(args, num_episodes=num_episodes, run_dir=Path(folder) / "run")
-        start = time.perf_counter()
+        start = time.process_time()
         steps = script.train(args).log.lengths.sum()
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
     return seconds, steps / seconds
 
 
@@ -79,19 +80,19 @@ def bonus_speed(window, visits=20_000):
     pairs = np.concatenate([np.eye(world.num_actions, dtype=np.float32)[actions], obs], axis=3)
     novelty = script.VisitNovelty(1, world.num_agents, pairs.shape[3], window, 0.5 * world.cell, 0.01)
     novelty.bonus(pairs[:window], np.array([window]))
-    start = time.perf_counter()
+    start = time.process_time()
     novelty.bonus(pairs, np.array([visits]))
-    return (time.perf_counter() - start) / (visits * world.num_agents) * 1e6
+    return (time.process_time() - start) / (visits * world.num_agents) * 1e6
 
 
 def matrix_speed(size=1024, repeats=10):
     """Billions of arithmetic operations per second of a large single-precision matrix product: the limit of one core."""
     matrix = torch.ones(size, size)
     matrix @ matrix
-    start = time.perf_counter()
+    start = time.process_time()
     for _ in range(repeats):
         matrix @ matrix
-    return repeats * 2 * size**3 / (time.perf_counter() - start) / 1e9
+    return repeats * 2 * size**3 / (time.process_time() - start) / 1e9
 
 
 def update_profile(method, env, num_episodes=200):
@@ -105,9 +106,9 @@ def update_profile(method, env, num_episodes=200):
     collect, act, grad = script.collect, script.StackedMLP.__call__, torch.autograd.grad
 
     def timed(what, function, *args):
-        start = time.perf_counter()
+        start = time.process_time()
         result = function(*args)
-        seconds[what] += time.perf_counter() - start
+        seconds[what] += time.process_time() - start
         return result
 
     def watched_collect(*args):

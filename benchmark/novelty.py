@@ -1,0 +1,109 @@
+"""Does learned novelty lag behind? The exploration bonus of the first, tenth and hundredth visit to the same pair.
+
+    python benchmark/novelty.py                          # some minutes; draws docs/novelty.png
+
+Trains each script as it is, at its own defaults, and notes for every trial and window the bonus (before beta) of each visit to
+each pair u. Only pairs that are visited at least `VISITS` times count, so that all visit numbers speak of the same pairs.
+"""
+
+import contextlib
+import dataclasses
+import io
+import sys
+import tempfile
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmark.cells import METHODS, ROOT, script
+from benchmark.figures import COLOURS, DASHES
+from benchmark.report import markdown
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+VISITS = 100
+
+
+def novelty_class(module):
+    """The name of a script's class that gives the exploration bonus."""
+    return next(name for name, value in vars(module).items() if isinstance(value, type) and hasattr(value, "bonus"))
+
+
+def bonuses_of_visits(method, args):
+    """Train; returns the bonus of the first VISITS visits to each pair that has as many, [pairs, VISITS]."""
+    module, seen = script(method), defaultdict(list)
+    name = novelty_class(module)
+    original = getattr(module, name)
+
+    class Watched(original):
+        def bonus(self, pairs, *rest):
+            values, *figures = super().bonus(pairs, *rest)
+            (lengths, *_) = rest
+            for k, length in enumerate(lengths):
+                for w in range(pairs.shape[2]):
+                    for pair, value in zip(pairs[:length, k, w], values[:length, k, w], strict=True):
+                        visits = seen[k, w, pair.tobytes()]
+                        if len(visits) < VISITS:
+                            visits.append(value)
+            return values, *figures
+
+    setattr(module, name, Watched)
+    try:
+        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+            module.train(dataclasses.replace(module.Args(), run_dir=Path(folder) / "run", **args))
+    finally:
+        setattr(module, name, original)
+    return np.array([visits for visits in seen.values() if len(visits) == VISITS])
+
+
+def draw(curves, worlds, path):
+    """Mean bonus of the n-th visit beside that of the first, one panel for each world."""
+    figure, axes = plt.subplots(1, len(worlds), figsize=(4.6 * len(worlds), 3.2), layout="constrained", squeeze=False)
+    for axis, world in zip(axes[0], worlds, strict=True):
+        for (method, where), bonuses in curves.items():
+            if where == world:
+                mean, look = bonuses.mean(0), dict(color=COLOURS[method], label=METHODS[method])
+                axis.plot(np.arange(VISITS) + 1, mean / mean.max(), DASHES.get(method, "-"), **look)
+        axis.set_xscale("log")
+        axis.set_ylim(-0.03, 1.03)
+        axis.set_title(world, fontsize="medium")
+        axis.set_xlabel("visit to the same pair")
+        axis.set_ylabel("bonus / largest")
+    axes[0, -1].legend(frameon=False, fontsize="small")
+    figure.savefig(path, dpi=130)
+
+
+def main(
+    methods: tuple[str, ...] = ("decespg", "espg", "decespg_ex2", "espg_icm", "espg_emi"),
+    worlds: tuple[str, ...] = ("findtreasure", "pushbox"),
+    num_trials: int = 5,
+    num_episodes: int = 1000,
+):
+    """Train, print a table and draw.
+
+    Args:
+        methods: scripts with an exploration bonus
+        worlds: worlds to train in
+        num_trials: trials of each script
+        num_episodes: episodes of each trial
+    """
+    curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th", "10th : 1st", "100th : 1st"]]
+    for method in methods:
+        for world in worlds:
+            bonuses = curves[method, world] = bonuses_of_visits(
+                method, dict(env=world, num_trials=num_trials, num_episodes=num_episodes)
+            )
+            first, tenth, hundredth = (bonuses[:, n - 1].mean() for n in (1, 10, VISITS))
+            figures = [f"{value:.3g}" for value in (first, tenth, hundredth, tenth / first, hundredth / first)]
+            rows.append([method, world, str(len(bonuses)), *figures])
+    draw(curves, worlds, ROOT / "docs" / "novelty.png")
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
