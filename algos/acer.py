@@ -9,10 +9,9 @@ once more from an old one. With mu, the policy that played it, rho = pi / mu and
 is where pi(. | o_t) goes, though no faster away from a running average of the policy than the trust region allows.
 
 Wang et al., "Sample Efficient Actor-Critic with Experience Replay" (ICLR 2017): Eqs. 5 and 9-12, and Section 4 for c, delta,
-alpha, the weight of the entropy and one replay an episode. The
-traces are cut at 1, as in its published implementations. A segment is a whole episode. The replay is concurrent: all agents of
-a team learn from the same old episode, each with the ratio of its own actions (Omidshafiei et al., ICML 2017). Section 4.2 of
-Jiang & Amato (SAC 2021) asks for that and gives no numbers.
+alpha, the weight of the entropy and one replay an episode. The traces are cut at 1, as in its published implementations. A
+segment is a whole episode. The replay is concurrent: all agents of a team learn from the same old episode, each with the ratio
+of its own actions (Omidshafiei et al., ICML 2017). Section 4.2 of Jiang & Amato (SAC 2021) asks for that and gives no numbers.
 
     python algos/acer.py --env findtreasure --num-trials 20
 """
