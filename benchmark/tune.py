@@ -40,6 +40,14 @@ BETAS = {
     "cleaner": (0.01, 0.03, 0.1),
     "movebox": (0.03, 0.1, 0.3),
 }
+# Of bonuses that are errors of learnt models.
+LEARNT_BETAS = {
+    "findtreasure": (0.1, 0.3, 1.0),
+    "pushbox": (1.0, 3.0, 10.0),
+    "gotogether": (0.1, 0.3, 1.0),
+    "cleaner": (0.03, 0.1, 0.3),
+    "movebox": (0.1, 0.3, 1.0),
+}
 # The number of a method's own that is tuned, and its values in each world; pg has none, and so nothing to tune in SAME_SIZE.
 OWN = {
     "pg": ("", {world: (None,) for world in EPISODES if world not in SAME_SIZE}),
@@ -52,6 +60,11 @@ OWN = {
     "acer": ("critic_learning_rate", dict.fromkeys(EPISODES, (3e-4, 1e-3, 3e-3))),
     "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
+    "espg_icm": ("beta", LEARNT_BETAS),
+    "gasil": (
+        "lambda_im",
+        dict.fromkeys(EPISODES, (3.0, 10.0, 30.0)) | {"gotogether": (0.3, 1.0, 3.0), "cleaner": (0.1, 0.3, 1.0)},
+    ),
 }
 COLUMNS = ("world", "optimizer", "learning_rate", "own", "last 5 %", "worst trial", "all episodes", "chosen")
 

@@ -333,6 +333,7 @@ def test_tensorboard_shows_the_means_between_its_points(finished):
     own = {"pg": [], "spg": [], "epg": bonus, "espg": bonus, "decespg": bonus, "ac": critic, "coma": critic}
     own |= {
         "edti": [*critic, "novelty", "influence", "table_fill"],
+        "espg_icm": ["bonus", "inverse_loss", "inverse_accuracy"],
         "acer": ["value", "trust_region"],
         "dqn": ["epsilon", "value"],
     }
@@ -351,7 +352,7 @@ def test_tensorboard_shows_the_means_between_its_points(finished):
         for tag, values in expected.items():
             assert [value for _, value in shown[f"charts/{tag}"]] == pytest.approx(values, rel=1e-5)
         assert min(value for _, value in shown["charts/SPS"]) > 0
-        if "charts/bonus" in shown:
+        if "charts/unvisited" in shown:
             assert all(0 < value < np.log(1000) for _, value in shown["charts/bonus"])
             assert all(0 < value < 1 for _, value in shown["charts/unvisited"])
 
@@ -638,6 +639,14 @@ BAD_INPUT_OF = {
     "epg": BAD_BONUS,
     "espg": BAD_BONUS | BAD_MEMORY,
     "decespg": BAD_BONUS | BAD_MEMORY,
+    "espg_icm": {
+        **BAD_MEMORY,
+        "--beta -1": "--beta must be a number of at least 0, not -1",
+        "--icm-learning-rate -1": "--icm-learning-rate must be a number of at least 0, not -1",
+        "--forward-weight 1.1": "--forward-weight must be a number between 0 and 1, not 1.1",
+        "--features 0": "--features must be a number of at least 1, not 0",
+        "--icm-hidden 64 0": "--icm-hidden must be a number of at least 1, not 0",
+    },
     "ac": BAD_CRITIC,
     "coma": {
         **BAD_CRITIC,
@@ -668,6 +677,17 @@ BAD_INPUT_OF = {
         "--beta-ext -1": "--beta-ext must be a number of at least 0, not -1",
         "--beta-int -1": "--beta-int must be a number of at least 0, not -1",
         "--table-size 7": "--table-size must be a number of at least 8, not 7",
+    },
+    "gasil": {
+        **BAD_BONUS,
+        "--lambda-im -1": "--lambda-im must be a number of at least 0, not -1",
+        "--rise 0": "--rise must be a number between 0.001 and 1, not 0",
+        "--rise 2": "--rise must be a number between 0.001 and 1, not 2",
+        "--good-episodes 0": "--good-episodes must be a number of at least 1, not 0",
+        "--good-label 1.1": "--good-label must be a number between 0 and 1, not 1.1",
+        "--good-batch 0": "--good-batch must be a number of at least 1, not 0",
+        "--discriminator-hidden 32 0": "--discriminator-hidden must be a number of at least 1, not 0",
+        "--discriminator-learning-rate -1": "--discriminator-learning-rate must be a number of at least 0, not -1",
     },
 }
 

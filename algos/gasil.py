@@ -1,0 +1,789 @@
+"""GASIL: DecESPG with generative adversarial self-imitation in the place of the selective memory, on the base of decespg.py.
+
+1. Every agent has decespg.py's private exploration bonus (--beta 0: plain GASIL).
+2. The team keeps its best episodes. Every agent's discriminator D(o, a) learns to tell their steps (label 0.9) from those of
+   the current episode (label 0), and the agent's reward becomes r' = r + beta EB(u) + lambda_im r_im, where
+   r_im = clip(-log(1 - clip(D, 0.01, 0.99)) + log 1/2, -1/2, 3/2)
+   is positive for what good episodes do more often than the current one, and negative for what they do less often.
+
+Hao et al., "Independent Generative Adversarial Self-Imitation Learning in Cooperative Multiagent Systems" (AAMAS 2019). Labels,
+r_im, the rise of lambda_im, the number of good episodes and D's layers are those of its code, which trains deterministic
+policies with critics for 140 000 episodes (github.com/tjuHaoXiaotian/GASIL). Here policies draw their actions and learn from
+the episode that they have just played, never from stored actions, as in Guo et al., "Generative Adversarial Self-Imitation
+Learning" (2018). What else differs from the code:
+- Good is a high discounted return, as for decespg.py's memory: the undiscounted one does not prefer a shorter way. Stored
+  episodes do not age (in the code their return falls by 0.01 in every episode, which belongs to its scale of reward): these
+  worlds are deterministic, so a success is never luck.
+- Episodes are kept, and their steps drawn, for the team: all agents' discriminators see the same good steps.
+- D has an output for each action, ReLU and no layer normalisation. After each episode it makes one step, with this episode
+  in the place of the last 32 and without the task to tell stored actions from the policy's in the same observations. All
+  steps count the same, as in the code after the rise.
+As in the code, whole episodes are kept; the paper's sub-curriculum is left out.
+
+    python algos/gasil.py --env pushbox --seed 3
+"""
+
+import contextlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from copy import copy
+from dataclasses import asdict, dataclass, fields
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from numba import njit
+from torch.nn.functional import softplus
+from torch.utils.tensorboard import SummaryWriter
+from tqdm import tqdm
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import envs
+
+sys.modules.setdefault(Path(__file__).stem, sys.modules[__name__])  # where numba's cache looks after an import by this name
+
+# Table 1 of the paper.
+WORLDS = {
+    "cleaner": dict(hidden=(256, 128), gamma=0.99, max_steps=200, num_episodes=20_000),
+    "findtreasure": dict(hidden=(64,), gamma=0.98, max_steps=200, num_episodes=10_000),
+    "gotogether": dict(hidden=(64,), gamma=0.98, max_steps=2000, num_episodes=10_000),
+    "movebox": dict(hidden=(256, 128), gamma=0.999, max_steps=200, num_episodes=20_000),
+    "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
+}
+# The tuning rule's choice for each world and optimiser (benchmark/tuning/gasil.csv); guesses where it has no row yet.
+TUNED = {
+    ("cleaner", "sign"): dict(learning_rate=1e-3, beta=0.01, lambda_im=0.3),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=0.3),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=10.0),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, lambda_im=10.0),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=1.0),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.1, lambda_im=1.0),
+    ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=10.0),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.3, lambda_im=10.0),
+    ("pushbox", "sign"): dict(learning_rate=3e-4, beta=1.0, lambda_im=10.0),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, beta=10.0, lambda_im=10.0),
+}
+# The lowest and highest value of every number that makes sense.
+LIMITS = dict(
+    **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
+    **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
+    **dict(beta=(0, np.inf), window=(1, np.inf), sigma=(1e-3, np.inf), noise=(1e-6, np.inf)),
+    **dict(lambda_im=(0, np.inf), rise=(1e-3, 1), good_episodes=(1, np.inf), good_label=(0, 1), good_batch=(1, np.inf)),
+    **dict(discriminator_hidden=(1, np.inf), discriminator_learning_rate=(0, np.inf)),
+)
+
+
+@dataclass
+class Args:
+    env: str = "pushbox"
+    """world: cleaner, findtreasure, gotogether, movebox or pushbox"""
+    env_args: tuple[str, ...] = ()
+    """options of the world, such as size=6 (envs/<world>.py lists them)"""
+    seed: int = 1
+    """seed of the first trial; trial k has seed + k"""
+    num_trials: int = 1
+    """independent trials, trained side by side in this process"""
+    num_episodes: int | None = None
+    """training episodes of each trial (None: Table 1); with --evaluate, episodes to play (None: 100)"""
+    max_steps: int | None = None
+    """time limit of an episode in steps (None: Table 1)"""
+    hidden: tuple[int, ...] | None = None
+    """widths of the hidden layers (None: Table 1)"""
+    gamma: float | None = None
+    """discount factor (None: Table 1)"""
+    optimizer: Literal["sign", "adam"] = "sign"
+    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    learning_rate: float | None = None
+    """step size of the policies (None: tuned for world and optimiser)"""
+    log_every: int = 100
+    """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
+    run_dir: Path | None = None
+    """where the run's files go (None: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
+    checkpoint_every: float = 60.0
+    """seconds between two checkpoints (longer where writing one would take over 2 % of the time)"""
+    resume: bool = False
+    """go on from the checkpoint in the run's directory"""
+    overwrite: bool = False
+    """start anew even if the run's directory holds results"""
+    save_model: bool = False
+    """write the trained policies to policy.pt"""
+    capture_video: bool = False
+    """write one episode of the first trial's trained team to team.gif"""
+    evaluate: Path | None = None
+    """do not train: play the teams of this policy.pt, print how their episodes end and write a GIF beside it"""
+    greedy: bool = False
+    """with --evaluate: take the likeliest actions instead of drawing from the policies"""
+    beta: float | None = None
+    """weight of the exploration bonus, in units of reward (beta of Eq. 9; None: tuned for world and optimiser)"""
+    window: int = 50
+    """visits that are remembered (m of Section 3.1.4)"""
+    sigma: float = 0.5
+    """width of the kernel (sigma of Eq. 5), in cells where agents observe positions, else in units of the observation"""
+    noise: float = 0.01
+    """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
+    lambda_im: float | None = None
+    """final weight of the imitation reward, in units of reward (None: tuned for world and optimiser)"""
+    rise: float = 0.086
+    """share of the episodes in which lambda_im rises to its final weight (Hao et al.: 12 000 of 140 000)"""
+    good_episodes: int = 32
+    """best episodes that the team keeps (Hao et al.)"""
+    good_label: float = 0.9
+    """what the discriminators are to say to good steps, less than 1 so that they stay unsure (Hao et al.)"""
+    good_batch: int = 128
+    """good steps from which the discriminators learn after each episode"""
+    discriminator_hidden: tuple[int, ...] = (32, 32)
+    """widths of the discriminators' hidden layers (Hao et al.)"""
+    discriminator_learning_rate: float = 3e-3
+    """step size of the discriminators, which always have a persistent Adam (Hao et al.: 1e-3, but many more steps)"""
+
+
+class StackedMLP:
+    """Independent multilayer perceptrons with ReLU side by side, applied with one batched product per layer."""
+
+    def __init__(self, generators, nets_per_trial, sizes):
+        """Weights [num_nets, in, out], biases [num_nets, 1, out], all ~ U(-1/sqrt(in), 1/sqrt(in)); one generator a trial."""
+        self.params = []
+        for width, next_width in pairwise(sizes):
+            for rows in (width, 1):
+                shape, bound = (nets_per_trial, rows, next_width), width**-0.5
+                draws = np.concatenate([generator.uniform(-bound, bound, shape) for generator in generators])
+                self.params.append(torch.from_numpy(draws).float().requires_grad_())
+
+    def __call__(self, x):
+        """x [num_nets, batch, in] -> [num_nets, batch, out]."""
+        for layer in range(0, len(self.params), 2):
+            if layer > 0:
+                x = torch.relu(x)
+            x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
+        return x
+
+    def subset(self, nets):
+        """A copy of some of the networks."""
+        part = copy(self)
+        part.params = [param[nets] for param in self.params]
+        return part
+
+
+Policy = StackedMLP  # what agents act with: observations to logits of the actions
+
+
+class StackedOptimizer:
+    """Gradient descent for stacked networks, every network on its own.
+
+    "sign": w -= lr g / (|g| + 1e-8), which is exactly the first step of a fresh Adam (the authors create one in every update).
+    "adam": Adam (Kingma & Ba, 2015) with betas 0.9 and 0.999; moments and step count belong to the network.
+    """
+
+    def __init__(self, params, kind, learning_rate):
+        self.params, self.kind, self.learning_rate = params, kind, learning_rate
+        self.count = torch.zeros(len(params[0]), 1, 1)
+        self.moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params if kind == "adam"]
+        self.state = [self.count, *(m.requires_grad_(False) for pair in self.moments for m in pair)]
+
+    @torch.no_grad()
+    def step(self, grads, active=None):
+        """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
+        mask = 1.0 if active is None else active.view(-1, 1, 1).float()
+        if self.kind == "sign":
+            for param, grad in zip(self.params, grads, strict=True):
+                step = grad if active is None else grad * mask
+                param.addcdiv_(step, grad.abs().add_(1e-8), value=-self.learning_rate)
+            return
+        self.count += mask
+        correction1, correction2 = (1 - decay ** self.count.clamp(min=1) for decay in (0.9, 0.999))
+        for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
+            first += (0.1 * mask) * (grad - first)
+            second += (0.001 * mask) * (grad * grad - second)
+            step = first / correction1 * mask
+            param.addcdiv_(step, (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
+
+
+@njit(cache=True)
+def sample_actions(logits, uniforms):
+    """Draw from softmax(logits) by inverting the distribution function.
+
+    logits [num_trials, num_agents, num_actions], uniforms in [0, 1) [num_trials, num_agents] -> actions, shaped as uniforms.
+    """
+    actions = np.empty(uniforms.shape, np.int64)
+    for k in range(logits.shape[0]):
+        for i in range(logits.shape[1]):
+            highest = logits[k, i].max()
+            total = 0.0
+            for logit in logits[k, i]:
+                total += np.exp(np.float64(logit - highest))
+            a, remaining = -1, uniforms[k, i] * total
+            while remaining >= 0.0 and a < logits.shape[2] - 1:
+                a += 1
+                remaining -= np.exp(np.float64(logits[k, i, a] - highest))
+            actions[k, i] = a
+    return actions
+
+
+class Rollout:
+    """One episode of every trial, time first; a row beyond a trial's length counts for nothing.
+
+    Only `obs` has one row more, for what was seen after the last step (critics ask for it where the time limit cuts).
+    """
+
+    def __init__(self, env):
+        world, shape = env.world, (env.world.max_steps, env.num_envs)
+        self.obs = np.zeros((world.max_steps + 1, env.num_envs, world.num_agents, world.obs_dim), np.float32)
+        self.actions = np.zeros((*shape, world.num_agents), np.int64)
+        self.reward = np.zeros(shape)
+        self.lengths = np.zeros(env.num_envs, np.int64)
+        self.outcomes = np.zeros(env.num_envs, np.int64)
+
+
+@torch.no_grad()
+def collect(env, policy, uniforms, rollout, frames=None):
+    """Play one episode in every world, in lock step until the last has ended, and write it into `rollout`.
+
+    The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
+    Pictures of the first world are appended to `frames` if it is a list.
+    """
+    num_agents = env.world.num_agents
+    rollout.obs[0], _ = env.reset()
+    if frames is not None:
+        frames.append(env.draw(0, caption="start"))
+    rollout.lengths[:] = 0
+    running, playing, num_playing, actor = np.ones(env.num_envs, bool), slice(None), env.num_envs, policy
+    actions = np.zeros(rollout.actions.shape[1:], np.int64)
+    for t in range(env.world.max_steps):
+        logits = actor(torch.from_numpy(rollout.obs[t][playing]).view(num_playing * num_agents, 1, -1))
+        logits = logits.view(num_playing, num_agents, -1).numpy()
+        actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
+        rollout.actions[t] = actions
+        rollout.lengths += running
+        rollout.obs[t + 1], rollout.reward[t], terminated, truncated, info = env.step(actions)
+        if frames is not None and running[0]:
+            frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
+        running = ~(terminated | truncated)
+        num_running = np.count_nonzero(running)
+        if num_running == 0:
+            break
+        if 2 * num_running <= num_playing:  # acting takes as long as there are networks: let those that wait go
+            playing, num_playing = np.flatnonzero(running), num_running
+            actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
+    rollout.outcomes[:] = info["outcome"]
+
+
+@njit(cache=True)
+def discounted_returns(reward, lengths, gamma):
+    """G_t = r_t + gamma G_{t+1} of every step; reward [T, num_trials, num_agents], lengths [num_trials] -> shaped as reward."""
+    returns = np.zeros(reward.shape)
+    for k in range(reward.shape[1]):
+        for i in range(reward.shape[2]):
+            tail = 0.0
+            for t in range(lengths[k] - 1, -1, -1):
+                tail = reward[t, k, i] + gamma * tail
+                returns[t, k, i] = tail
+    return returns
+
+
+@njit(cache=True)
+def merge_steps(obs, actions, weights, lengths, num_actions):
+    """Add up the weights of equal steps: sum_t w_t log pi(a_t | o_t) needs every distinct observation only once.
+
+    obs [T, num_trials, num_agents, obs_dim], actions and weights [T, num_trials, num_agents], lengths [num_trials]
+    -> distinct observations [num_nets, U, obs_dim] and the weights of all actions there [num_nets, U, num_actions], 0 in the
+    rows that a network with fewer than U distinct observations leaves over. There is one network per trial and agent.
+    """
+    _, trials, agents, dim = obs.shape
+    distinct = np.zeros((trials * agents, lengths.max(), dim), np.float32)
+    weight = np.zeros((trials * agents, lengths.max(), num_actions))
+    buckets = 2
+    while buckets < 2 * lengths.max():
+        buckets *= 2
+    bits = obs.view(np.int32)
+    most = 0
+    for k in range(trials):
+        for i in range(agents):
+            net, found = k * agents + i, 0
+            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
+            for t in range(lengths[k]):
+                bucket = 0
+                for j in range(dim):
+                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
+                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
+                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
+                    bucket = (bucket + 1) & (buckets - 1)
+                if row_in[bucket] < 0:
+                    row_in[bucket] = found
+                    distinct[net, found] = obs[t, k, i]
+                    found += 1
+                weight[net, row_in[bucket], actions[t, k, i]] += weights[t, k, i]
+            most = max(most, found)
+    return distinct[:, :most].copy(), weight[:, :most].astype(np.float32)
+
+
+@njit(cache=True)
+def slide_inverse(inverse, product, kernel, slot, full, diagonal):
+    """Bring inverse = (K + noise I)^-1 [m, m] up to date, in place, when a new visit takes row `slot` of the ring.
+
+    kernel [m] holds the new visit's kernel values (0 where nothing is remembered), product = inverse @ kernel, and diagonal is
+    1 + noise. Eqs. 12-13 number the rows from the oldest to the newest; in a ring the newest takes the row of the oldest.
+    """
+    m = len(kernel)
+    # B = H - f f^T / e (Eq. 13) is the inverse without the visit that stood in `slot`: its row is [.., e, ..] with f around e.
+    # Before the ring is full nothing stood there, B is the old inverse, and what follows is Eq. 11 with its e, g for B h, s.
+    row, per_e = inverse[slot].copy(), 1.0 / inverse[slot, slot] if full else 0.0
+    for c in range(m):
+        product[c] -= kernel[slot] * row[c]
+    kernel[slot] = 0.0  # kernel is h now
+    projection = product[slot] * per_e
+    s = diagonal
+    for c in range(m):
+        product[c] -= projection * row[c]  # product becomes B h
+        s -= kernel[c] * product[c]
+    s = 1.0 / s
+    # B + s (B h)(B h)^T, bordered by -s B h and s.
+    for r in range(m):
+        gain, loss = s * product[r], per_e * row[r]
+        if gain != 0.0 or loss != 0.0:
+            for c in range(m):
+                inverse[r, c] += gain * product[c] - loss * row[c]
+    for c in range(m):
+        inverse[slot, c] = inverse[c, slot] = -s * product[c]
+    inverse[slot, slot] = s
+
+
+@njit(cache=True)
+def visit_counts(pairs, lengths, rings, inverses, visits, sigma, noise):
+    """The bounded visit count eta of each pair u of an episode, which is then remembered; every window by itself.
+
+    pairs [T, num_trials, num_windows, pair_dim], lengths [num_trials] -> eta [T, num_trials, num_windows], 1 beyond the
+    episode's end. What is remembered stands in rings [num_trials, num_windows, pair_dim, m], visit number n in column n mod m,
+    and in inverses [num_trials, num_windows, m, m]; visits [num_trials] counts them.
+    """
+    _, trials, windows, dim = pairs.shape
+    m = rings.shape[3]
+    eta = np.ones((len(pairs), trials, windows))
+    kernel, product = np.empty(m), np.empty(m)
+    for k in range(trials):
+        for w in range(windows):
+            ring, inverse = rings[k, w], inverses[k, w]
+            for t in range(lengths[k]):
+                visit = visits[k] + t
+                # Eq. 5 with C = 1.
+                kernel[:] = 0.0
+                for d in range(dim):
+                    value = np.float64(pairs[t, k, w, d])
+                    for r in range(m):
+                        kernel[r] += (value - ring[d, r]) ** 2
+                for r in range(m):
+                    near = r < visit and kernel[r] < 80.0 * sigma * sigma  # exp(-40) is nothing beside 1
+                    kernel[r] = np.exp(-kernel[r] / (2.0 * sigma * sigma)) if near else 0.0
+
+                # Eq. 7 with targets 1, because every remembered pair was visited: eta = kernel^T inverse 1.
+                product[:] = 0.0
+                for r in range(m):
+                    if kernel[r] > 0.0:
+                        for c in range(m):
+                            product[c] += kernel[r] * inverse[r, c]
+                eta[t, k, w] = product.sum()
+
+                slot = visit % m
+                slide_inverse(inverse, product, kernel, slot, visit >= m, 1.0 + noise)
+                ring[:, slot] = pairs[t, k, w]
+    for k in range(trials):
+        visits[k] += lengths[k]
+    return eta
+
+
+class VisitNovelty:
+    """The exploration bonus of Section 3.1: windows of the last m pairs u = (o, a), and a Gaussian process over each."""
+
+    def __init__(self, num_trials, num_windows, pair_dim, window, sigma, noise):
+        self.pairs = np.zeros((num_trials, num_windows, pair_dim, window))
+        self.inverse = np.zeros((num_trials, num_windows, window, window))
+        self.visits = np.zeros(num_trials, np.int64)
+        self.sigma, self.noise = sigma, noise
+        self.state = [self.pairs, self.inverse, self.visits]
+
+    def bonus(self, pairs, lengths):
+        """EB = -log eta of each pair u of an episode (Eq. 8), [T, num_trials, num_windows], and the shares of clamped ones.
+
+        In the paper eta lies in (0, 1]; here it is clamped to [1e-3, 1], because a pair unlike all that is remembered has
+        eta = 0 and a pair between several remembered ones may have eta > 1.
+        """
+        eta = visit_counts(pairs, lengths, *self.state, self.sigma, self.noise)
+        visits = lengths * eta.shape[2]
+        return -np.log(eta.clip(1e-3, 1)), (eta < 1e-3).sum((0, 2)) / visits, (eta > 1).sum((0, 2)) / visits
+
+
+class GoodEpisodes:
+    """The team's best episodes, whole and kept jointly."""
+
+    def __init__(self, env, size):
+        world, shape = env.world, (env.num_envs, size)
+        self.value = np.full(shape, -np.inf)  # the discounted return of the original reward
+        self.number = np.zeros(shape, np.int64)  # of the episode
+        self.lengths = np.zeros(shape, np.int64)
+        self.obs = np.zeros((*shape, world.max_steps, world.num_agents, world.obs_dim), np.float32)
+        self.actions = np.zeros((*shape, world.max_steps, world.num_agents), np.int64)
+        self.state = [self.value, self.number, self.lengths, self.obs, self.actions]
+
+    def remember(self, episode, rollout, value):
+        """Keep each trial's episode, which has this number and value [num_trials], in the place of the worst if it is as good.
+
+        Of equally bad ones the oldest goes, so that what good teams do now is there to imitate.
+        """
+        worst = np.lexsort((self.number, self.value))[:, 0]
+        for k, (slot, length) in enumerate(zip(worst, rollout.lengths, strict=True)):
+            if value[k] >= self.value[k, slot]:
+                self.value[k, slot], self.number[k, slot], self.lengths[k, slot] = value[k], episode, length
+                self.obs[k, slot, :length] = rollout.obs[:length, k]
+                self.actions[k, slot, :length] = rollout.actions[:length, k]
+
+    def draw(self, generators, num_steps):
+        """Steps of the whole team, uniformly from all that are kept and with replacement, each trial's by its own generator.
+
+        Returns obs [num_steps, num_trials, num_agents, obs_dim] and actions [num_steps, num_trials, num_agents].
+        """
+        ends, trials = self.lengths.cumsum(1), np.arange(len(self.lengths))  # the episodes of a trial, one after the other
+        steps, slots = np.empty((2, num_steps, len(trials)), np.int64)
+        for k, generator in enumerate(generators):
+            steps[:, k] = generator.integers(ends[k, -1], size=num_steps)
+            slots[:, k] = np.searchsorted(ends[k], steps[:, k], side="right")
+        steps -= (ends - self.lengths)[trials, slots]
+        return self.obs[trials, slots, steps], self.actions[trials, slots, steps]
+
+
+def step_shares(obs, actions, lengths, num_actions):
+    """The distinct observations of the first `lengths` steps, and which share of these steps did what in each.
+
+    Arguments and results are shaped as those of `merge_steps`, which does it.
+    """
+    shares = np.ones(actions.shape) / lengths[:, None]
+    return merge_steps(obs, actions, shares, lengths, num_actions)
+
+
+def imitation_reward(d):
+    """r_im = -log(1 - D) + log 1/2, kept in [-1/2, 3/2]; D = 1/2, where good and own steps look alike, gives 0."""
+    return (np.log(0.5) - np.log(1 - np.clip(d, 0.01, 0.99))).clip(-0.5, 1.5)
+
+
+class Discriminators:
+    """Every agent's D(o, a): how likely it is that a good episode did a in o, and not the current one."""
+
+    def __init__(self, init, world, hidden, learning_rate, good_label):
+        # Observations to log D / (1 - D) of the actions.
+        self.net = StackedMLP(init, world.num_agents, [world.obs_dim, *hidden, world.num_actions])
+        self.optimizer = StackedOptimizer(self.net.params, "adam", learning_rate)
+        self.good_label = good_label
+        self.state = [*self.net.params, *self.optimizer.state]
+
+    def learn(self, good, own):
+        """One step towards telling good steps from own ones, both as `step_shares` gives them.
+
+        Returns the mean D of the good and of the own steps before it, [num_nets] each.
+        """
+        logits = self.net(torch.from_numpy(np.concatenate([good[0], own[0]], axis=1)))  # [num_nets, U of both, num_actions]
+        good_logits, own_logits = logits.split([good[0].shape[1], own[0].shape[1]], dim=1)
+        good_share, own_share = torch.from_numpy(good[1]), torch.from_numpy(own[1])
+        # For any label, -label log D - (1 - label) log(1 - D) = softplus(logit) - label logit.
+        loss = (good_share * (softplus(good_logits) - self.good_label * good_logits)).sum()
+        loss += (own_share * softplus(own_logits)).sum()
+        self.optimizer.step(torch.autograd.grad(loss, self.net.params))
+        return [
+            (share * torch.sigmoid(logits.detach())).sum((1, 2)).numpy()
+            for share, logits in ((good_share, good_logits), (own_share, own_logits))
+        ]
+
+    @torch.no_grad()
+    def reward(self, obs, actions):
+        """r_im of steps; obs [T, num_trials, num_agents, obs_dim], actions [T, num_trials, num_agents] -> shaped as actions."""
+        logits = self.net(torch.from_numpy(obs).flatten(1, 2).transpose(0, 1))  # [num_nets, T, num_actions]
+        d = torch.sigmoid(logits.transpose(0, 1)).reshape(*actions.shape, -1).double().numpy()
+        return imitation_reward(np.take_along_axis(d, actions[..., None], axis=3)[..., 0])
+
+
+def train(args: Args):
+    """Train `num_trials` teams side by side; returns the policies, the method's parts and the log of all episodes."""
+    torch.set_num_threads(1)
+    args, env = resolve(args)
+    world, num_agents = env.world, env.world.num_agents
+    seeds = [np.random.SeedSequence(args.seed + k).spawn(3) for k in range(args.num_trials)]
+    init, act, learn = [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
+
+    policy = Policy(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
+    optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
+    one_hot = np.eye(world.num_actions, dtype=np.float32)
+    pair_dim = world.num_actions + world.obs_dim
+    novelty = VisitNovelty(args.num_trials, num_agents, pair_dim, args.window, args.sigma * world.cell, args.noise)
+    good = GoodEpisodes(env, args.good_episodes)
+    sizes, learning_rate = args.discriminator_hidden, args.discriminator_learning_rate
+    discriminators = Discriminators(init, world, sizes, learning_rate, args.good_label)
+    batch = np.full(args.num_trials, args.good_batch)
+    rollout = Rollout(env)
+    uniforms = np.empty((args.num_trials, world.max_steps, num_agents))
+    arrays = [*policy.params, *optimizer.state, *novelty.state, *good.state, *discriminators.state]
+    figures = ("bonus", "unvisited", "overvisited", "d_good", "d_own")
+    run = Run(args, env, arrays, generators=[*act, *learn], figures=figures)
+
+    for episode in run.episodes():
+        # Play one episode of every trial.
+        for generator, row in zip(act, uniforms, strict=True):
+            generator.random(out=row)
+        collect(env, policy, uniforms, rollout)
+        lengths, longest = rollout.lengths, rollout.lengths.max()
+        reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
+
+        # Augment each agent's reward with its own exploration bonus, Eq. 9, and remember the visits.
+        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
+        bonus, unvisited, overvisited = novelty.bonus(pairs, lengths)
+        augmented = reward + args.beta * bonus
+
+        # Keep the good episodes, by the original reward, and learn to tell their steps from those of this one.
+        good.remember(episode, rollout, discounted_returns(reward, lengths, args.gamma)[0, :, 0])
+        own_steps = step_shares(rollout.obs, rollout.actions, lengths, world.num_actions)
+        good_steps = step_shares(*good.draw(learn, args.good_batch), batch, world.num_actions)
+        d_good, d_own = discriminators.learn(good_steps, own_steps)
+
+        # Augment each agent's reward with that for what looks like good episodes.
+        lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / (args.rise * args.num_episodes) - 1)))
+        augmented += lambda_im * discriminators.reward(rollout.obs[:longest], rollout.actions[:longest])
+
+        # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.
+        returns = discounted_returns(augmented, lengths, args.gamma)
+        obs, weight = merge_steps(rollout.obs, rollout.actions, returns / lengths[:, None], lengths, world.num_actions)
+        log_probs = torch.log_softmax(policy(torch.from_numpy(obs)), dim=-1)
+        loss = -(torch.from_numpy(weight) * log_probs).sum()
+        optimizer.step(torch.autograd.grad(loss, policy.params))
+
+        mean_bonus = bonus.sum((0, 2)) / (lengths * bonus.shape[2])
+        d_good, d_own = (d.reshape(-1, num_agents).mean(1) for d in (d_good, d_own))
+        run.record(episode, rollout, bonus=mean_bonus, unvisited=unvisited, overvisited=overvisited, d_good=d_good, d_own=d_own)
+    run.finish(policy)
+    return SimpleNamespace(policy=policy, novelty=novelty, good=good, discriminators=discriminators, log=run.log)
+
+
+# --- run keeping ---
+# Arguments, directories, curves, checkpoints and evaluation: the same text in every script, and nothing that a method needs.
+
+METHOD = Path(__file__).stem
+HOUSEKEEPING = ("run_dir", "checkpoint_every", "resume", "overwrite", "save_model", "capture_video", "evaluate", "greedy")
+
+
+def resolve(args):
+    """The arguments with every None filled in from WORLDS and TUNED, and the worlds; UsageError for what is impossible."""
+    tuned = TUNED.get((args.env, getattr(args, "optimizer", "adam")), {})  # Q-learning has no policies, and Adam always
+    defaults = {**WORLDS.get(args.env, {}), **tuned, "run_dir": default_run_dir(args)}
+    values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
+    options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
+    envs.make_world(args.env, **options)
+    values["max_steps"] = options["max_steps"]
+    for name in LIMITS:
+        check_limits(name, values[name])
+    return type(args)(**values), envs.make_vec(args.env, args.num_trials, **options)
+
+
+def check_limits(name, values):
+    """UsageError if an argument, or one of its numbers if it has several, is outside its LIMITS."""
+    for value in values if isinstance(values, tuple) else [values]:
+        envs.check_number(f"--{name.replace('_', '-')}", value, *LIMITS[name])
+
+
+def default_run_dir(args):
+    """runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>]"""
+    words = [f"seed{args.seed}" + f"-{args.seed + args.num_trials - 1}" * (args.num_trials > 1)]
+    for field in fields(args):
+        value = getattr(args, field.name)
+        if value != field.default and field.name not in ("env", "seed", "num_trials", *HOUSEKEEPING):
+            words.append(f"{field.name}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
+    return Path("runs", args.env, METHOD, "-".join(words).replace("/", "_"))
+
+
+class Run:
+    """The directory of a run: curves, checkpoints, results.
+
+    arrays:     all arrays and tensors that training changes (of fixed shape; a checkpoint keeps them in this order)
+    generators: all random generators that training uses
+    figures:    names of the method's own curves, for which `record` takes values [num_trials]
+    """
+
+    def __init__(self, args, env, arrays, generators, figures=()):
+        self.args, self.env, self.generators = args, env, generators
+        self.log = envs.EpisodeLog(env.world, args.num_trials, args.num_episodes)
+        self.sums = {name: np.zeros(args.num_trials) for name in figures}  # since the last point of the curves
+        arrays = [*arrays, self.log.returns, self.log.lengths, self.log.outcomes, *self.sums.values()]
+        self.arrays = [torch.from_numpy(a) if isinstance(a, np.ndarray) else a.detach() for a in arrays]
+        self.settings = {"method": METHOD, **{k: v for k, v in asdict(args).items() if k not in HOUSEKEEPING}}
+        self.checkpoint, self.result = args.run_dir / "checkpoint.pt", args.run_dir / "episodes.npz"
+        self.start = 0
+        if args.resume:
+            self._load_checkpoint()
+        self._open_directory()
+        trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
+        self.writers = [SummaryWriter(str(trial), purge_step=self.start + 1, max_queue=1000) for trial in trials]
+
+    def _open_directory(self):
+        directory, resume = self.args.run_dir, self.args.resume
+        kept = [directory / name for name in ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif")]
+        if not (resume or self.args.overwrite) and any(path.exists() for path in kept):
+            held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
+            advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
+            raise envs.UsageError(f"{directory} holds {held}; {advice}start anew with --overwrite.")
+        about = {"method": METHOD, "args": asdict(self.args), "python": sys.version.split()[0]}
+        about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
+        git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
+        with contextlib.suppress(OSError):
+            about["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            for old in [] if resume else [*kept, *directory.glob("seed*/events.*")]:
+                old.unlink(missing_ok=True)
+            with envs.complete_file(directory / "args.json") as file:
+                file.write(json.dumps(about, indent=2, default=str).encode())
+        except OSError as error:
+            raise envs.UsageError(f"cannot write to {directory}: {error.strerror}.") from error
+
+    def _load_checkpoint(self):
+        if not self.checkpoint.exists():
+            raise envs.UsageError(f"there is nothing to resume: {self.args.run_dir} holds no checkpoint of an unfinished run.")
+        try:
+            saved = torch.load(self.checkpoint, weights_only=True)
+        except Exception as error:  # whatever can be wrong with a file
+            raise envs.UsageError(f"{self.checkpoint} cannot be read; start anew with --overwrite.") from error
+        for name, value in self.settings.items():
+            if (kept := saved["settings"].get(name)) != value:
+                raise envs.UsageError(f"--resume needs the same arguments, but {name} was {kept} and is now {value}.")
+        self.start = saved["episode"]
+        for array, kept in zip(self.arrays, saved["arrays"], strict=True):
+            array.copy_(kept)
+        for generator, state in zip(self.generators, saved["generators"], strict=True):
+            generator.bit_generator.state = state
+
+    def _save_checkpoint(self, episode):
+        for writer in self.writers:
+            writer.flush()
+        states = [generator.bit_generator.state for generator in self.generators]
+        with envs.complete_file(self.checkpoint) as file:
+            torch.save({"settings": self.settings, "episode": episode, "arrays": self.arrays, "generators": states}, file)
+
+    def episodes(self):
+        """Yield the number of every episode to play; between two of them write checkpoints and listen to Ctrl-C."""
+        first, last, stopped = self.start, self.args.num_episodes, []
+        handlers = {s: signal.signal(s, lambda number, _: stopped.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
+        self.bar = tqdm(initial=first, total=last, desc=f"{METHOD} {self.args.env}", unit="ep", mininterval=0.5)
+        self.clock = saved = time.monotonic()
+        pause = self.args.checkpoint_every
+        try:
+            for episode in range(first, last):
+                yield episode
+                self.bar.update()
+                if stopped or time.monotonic() - saved >= pause:
+                    began = time.monotonic()
+                    self._save_checkpoint(episode + 1)
+                    saved = time.monotonic()
+                    pause = max(self.args.checkpoint_every, 50 * (saved - began))
+                if stopped:
+                    self.bar.write(f"Stopped after {episode + 1} episodes; go on with --resume.", file=sys.stderr)
+                    sys.exit(128 + stopped[0])
+        finally:
+            self.bar.close()
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+
+    def record(self, episode, rollout, **figures):
+        """Keep one episode of every trial; every `log_every` episodes write the means since the last time to TensorBoard."""
+        self.log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
+        for name, values in figures.items():
+            self.sums[name] += values
+        done, every = episode + 1, self.args.log_every
+        if done % every:
+            return
+        recent, seconds = slice(done - every, done), time.monotonic() - self.clock
+        curves = self.log.means(recent)
+        steps = curves["episodic_length"] * every
+        curves.update(SPS=steps / seconds, **{name: total / every for name, total in self.sums.items()})
+        for name, values in curves.items():
+            for writer, value in zip(self.writers, values, strict=True):
+                writer.add_scalar(f"charts/{name}", value, done)
+        for total in self.sums.values():
+            total[:] = 0
+        recently = {"reward/step": f"{curves['reward_per_step'].mean():.2f}", "steps/s": f"{steps.sum() / seconds:.0f}"}
+        if self.env.world.outcome_names:
+            recently["trials at best"] = f"{self.log.share_at_best(recent):.0%}"
+        self.bar.set_postfix(recently, refresh=False)
+        self.clock = time.monotonic()
+
+    def finish(self, policy):
+        """Write what was asked for and, last of all, the file that marks the run as finished."""
+        args, directory = self.args, self.args.run_dir
+        for writer in self.writers:
+            writer.close()
+        if args.save_model:
+            team = {"method": METHOD, "env": args.env, "env_args": list(args.env_args), "max_steps": self.env.world.max_steps}
+            with envs.complete_file(directory / "policy.pt") as file:
+                torch.save({**team, "hidden": list(args.hidden), "params": [p.detach() for p in policy.params]}, file)
+        if args.capture_video:
+            play(self.env, policy, args, 1, directory / "team.gif")
+        with envs.complete_file(self.result) as file:
+            np.savez(file, returns=self.log.returns, lengths=self.log.lengths, outcomes=self.log.outcomes)
+        self.checkpoint.unlink(missing_ok=True)
+        print(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {self.log.summary()}")
+
+
+def play(env, policy, args, num_episodes, video):
+    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
+    rng, rollout, frames = np.random.default_rng(args.seed), Rollout(env), []
+    log = envs.EpisodeLog(env.world, env.num_envs, num_episodes)
+    for episode in range(num_episodes):
+        uniforms = None if args.greedy else rng.random((env.num_envs, env.world.max_steps, env.world.num_agents))
+        collect(env, policy, uniforms, rollout, frames if episode == 0 else None)
+        log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
+    try:
+        envs.save_gif(video, frames)
+    except OSError as error:
+        raise envs.UsageError(f"cannot write {video}: {error.strerror}.") from error
+    return log
+
+
+def load_teams(path):
+    """The worlds and the policies of a policy.pt that --save-model wrote; UsageError for anything else."""
+    if not path.exists():
+        raise envs.UsageError(f"there is no file {path}.")
+    try:
+        saved = torch.load(path, weights_only=True)
+        world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
+        teams = len(saved["params"][0]) // world.num_agents
+        sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
+        policy = Policy([np.random.default_rng(0)] * teams, world.num_agents, sizes)
+        for param, kept in zip(policy.params, saved["params"], strict=True):
+            param.data.copy_(kept)
+    except Exception as error:  # whatever can be wrong with a file
+        raise envs.UsageError(f"{path} is not a policy.pt that --save-model wrote.") from error
+    return envs.GridVectorEnv(world, teams), policy
+
+
+def evaluate(args):
+    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
+    torch.set_num_threads(1)
+    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
+    check_limits("num_episodes", num_episodes)
+    check_limits("seed", args.seed)
+    env, policy = load_teams(args.evaluate)
+    log = play(env, policy, args, num_episodes, video)
+    print(f"{args.evaluate}: {num_episodes} episodes of {env.num_envs} teams, {log.summary(share=1.0)}; one of them in {video}")
+
+
+def main():
+    try:
+        args = tyro.cli(Args, description=__doc__)
+        evaluate(args) if args.evaluate else train(args)
+    except envs.UsageError as error:
+        print(f"{METHOD}.py: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
