@@ -54,14 +54,14 @@ WORLDS = {
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
     ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
-    ("pushbox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
-    ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
 # The lowest and highest value of every number that makes sense.
 LIMITS = dict(

@@ -40,13 +40,20 @@ BETAS = {
     "cleaner": (0.01, 0.03, 0.1),
     "movebox": (0.03, 0.1, 0.3),
 }
-# Of bonuses that are errors of learnt models.
-LEARNT_BETAS = {
+# Bonuses that are errors of learnt models have other scales.
+CURIOSITY_BETAS = {
     "findtreasure": (0.1, 0.3, 1.0),
     "pushbox": (1.0, 3.0, 10.0),
     "gotogether": (0.1, 0.3, 1.0),
     "cleaner": (0.03, 0.1, 0.3),
     "movebox": (0.1, 0.3, 1.0),
+}
+EMBEDDING_BETAS = {
+    "findtreasure": (0.03, 0.1, 0.3),
+    "pushbox": (0.3, 1.0, 3.0),
+    "gotogether": (0.01, 0.03, 0.1),
+    "cleaner": (0.03, 0.1, 0.3),
+    "movebox": (0.03, 0.1, 0.3),
 }
 # The number of a method's own that is tuned, and its values in each world; pg has none, and so nothing to tune in SAME_SIZE.
 OWN = {
@@ -60,7 +67,8 @@ OWN = {
     "acer": ("critic_learning_rate", dict.fromkeys(EPISODES, (3e-4, 1e-3, 3e-3))),
     "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
-    "espg_icm": ("beta", LEARNT_BETAS),
+    "espg_icm": ("beta", CURIOSITY_BETAS),
+    "espg_emi": ("beta", EMBEDDING_BETAS),
     "gasil": (
         "lambda_im",
         dict.fromkeys(EPISODES, (3.0, 10.0, 30.0)) | {"gotogether": (0.3, 1.0, 3.0), "cleaner": (0.1, 0.3, 1.0)},

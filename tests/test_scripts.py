@@ -334,8 +334,10 @@ def test_tensorboard_shows_the_means_between_its_points(finished):
     own |= {
         "edti": [*critic, "novelty", "influence", "table_fill"],
         "espg_icm": ["bonus", "inverse_loss", "inverse_accuracy"],
+        "espg_emi": ["bonus", "unexplained", "information"],
         "acer": ["value", "trust_region"],
         "dqn": ["epsilon", "value"],
+        "gasil": [*bonus, "d_good", "d_own"],
     }
     usual = ["episodic_return", "episodic_length", "reward_per_step", "SPS"]
     for k in range(2):
@@ -670,6 +672,16 @@ BAD_INPUT_OF = {
         "--batch-size 0": "--batch-size must be a number of at least 1, not 0",
         "--train-every 0": "--train-every must be a number of at least 1, not 0",
         "--target-every 0": "--target-every must be a number of at least 1, not 0",
+    },
+    "espg_emi": {
+        **BAD_MEMORY,
+        "--beta -1": "--beta must be a number of at least 0, not -1",
+        "--embedding-learning-rate -1": "--embedding-learning-rate must be a number of at least 0, not -1",
+        "--embedding-batch 1": "--embedding-batch must be a number of at least 2, not 1",
+        "--recent-steps 0": "--recent-steps must be a number of at least 1, not 0",
+        "--error-weight -1": "--error-weight must be a number of at least 0, not -1",
+        "--information-weight nan": "--information-weight must be a number of at least 0, not nan",
+        "--gaussian-weight -1": "--gaussian-weight must be a number of at least 0, not -1",
     },
     "edti": {
         **BAD_CRITIC,
