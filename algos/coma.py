@@ -250,14 +250,48 @@ def collect(env, policy, uniforms, rollout, frames=None):
     rollout.outcomes[:] = info["outcome"]
 
 
-def steps_first(outputs, num_agents):
-    """What networks say, [num_nets, T, num_actions] -> [T, num_trials, num_agents, num_actions]."""
-    return outputs.unflatten(0, (-1, num_agents)).permute(2, 0, 1, 3)
+@njit(cache=True)
+def distinct_observations(obs, lengths):
+    """What the networks have to see of an episode: every distinct observation, the one after the last step too, but only once.
+
+    obs [T + 1, num_trials, num_agents, obs_dim], lengths [num_trials] -> distinct observations [num_nets, U, obs_dim], 0 in the
+    rows that a network with fewer than U leaves over, and each step's row among them [T + 1, num_trials, num_agents].
+    """
+    _, trials, agents, dim = obs.shape
+    distinct = np.zeros((trials * agents, lengths.max() + 1, dim), np.float32)
+    rows = np.zeros((lengths.max() + 1, trials, agents), np.int64)
+    buckets = 2
+    while buckets < 2 * lengths.max() + 2:
+        buckets *= 2
+    bits = obs.view(np.int32)
+    most = 0
+    for k in range(trials):
+        for i in range(agents):
+            net, found = k * agents + i, 0
+            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
+            for t in range(lengths[k] + 1):
+                bucket = 0
+                for j in range(dim):
+                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
+                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
+                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
+                    bucket = (bucket + 1) & (buckets - 1)
+                if row_in[bucket] < 0:
+                    row_in[bucket] = found
+                    distinct[net, found] = obs[t, k, i]
+                    found += 1
+                rows[t, k, i] = row_in[bucket]
+            most = max(most, found)
+    return distinct[:, :most].copy(), rows
 
 
-def networks_first(inputs):
-    """What networks are asked, [T, num_trials, num_agents, dim] -> [num_nets, T, dim]."""
-    return torch.from_numpy(inputs).flatten(1, 2).transpose(0, 1)
+def in_every_step(outputs, rows):
+    """What networks say step by step; outputs [num_nets, U, n], rows [T + 1, num_trials, num_agents] -> [.., n].
+
+    `rows` says where in the outputs a step is, as from `distinct_observations`.
+    """
+    nets = torch.arange(len(outputs)).view(rows.shape[1:])
+    return outputs[nets, torch.from_numpy(rows)]
 
 
 def critic_inputs(obs, actions, num_actions):
@@ -365,17 +399,19 @@ def train(args: Args):
 
         # What the policies say in every step, and after the last one, where the team draws actions that it does not play.
         with torch.no_grad():
-            logits = steps_first(policy(networks_first(rollout.obs[: longest + 1])), num_agents)
+            obs, rows = distinct_observations(rollout.obs, lengths)
+            logits = in_every_step(policy(torch.from_numpy(obs)), rows)  # [T + 1, num_trials, num_agents, num_actions]
         for generator, row in zip(learn, next_uniforms, strict=True):
             generator.random(out=row)
         actions = np.concatenate([rollout.actions[:longest], rollout.actions[:1]])  # [T + 1, num_trials, num_agents]
         actions[lengths, trials] = sample_actions(logits.numpy()[lengths, trials], next_uniforms)
 
         # The critics' values, before they learn from this episode, and their targets.
-        inputs = networks_first(critic_inputs(rollout.obs[: longest + 1], actions, world.num_actions))
-        values = steps_first(critic(inputs[:, :-1]), num_agents)  # [T, num_trials, num_agents, num_actions]
+        inputs, rows = distinct_observations(critic_inputs(rollout.obs[: longest + 1], actions, world.num_actions), lengths)
+        inputs = torch.from_numpy(inputs)
+        values = in_every_step(critic(inputs), rows)[:-1]  # [T, num_trials, num_agents, num_actions]
         with torch.no_grad():
-            target_values = steps_first(target_critic(inputs), num_agents)
+            target_values = in_every_step(target_critic(inputs), rows)
         target_values = np.take_along_axis(target_values.double().numpy(), actions[..., None], axis=3)[..., 0]
         targets = lambda_targets(reward, target_values, lengths, rollout.outcomes > 0, args.gamma, args.td_lambda)
 

@@ -91,12 +91,14 @@ def test_a_critic_is_asked_with_all_observations_and_the_others_actions(agents):
         assert not np.delete(same, i, axis=2).any()
 
 
-def test_networks_get_their_own_rows_and_give_them_back():
-    inputs = np.arange(5 * 3 * 2 * 4, dtype=np.float32).reshape(5, 3, 2, 4)
-    rows = coma.networks_first(inputs)
-    assert rows.shape == (6, 5, 4)
-    assert all(np.array_equal(rows[2 * k + i], inputs[:, k, i]) for k in range(3) for i in range(2))
-    assert np.array_equal(coma.steps_first(rows, 2), inputs)
+def test_networks_see_every_input_once_and_answer_in_every_step():
+    kinds, rng = np.random.default_rng(4).normal(size=(4, 3)).astype(np.float32), np.random.default_rng(5)
+    inputs, lengths = kinds[rng.integers(4, size=(21, 3, 2))], np.array([20, 1, 9])
+    distinct, rows = coma.distinct_observations(inputs, lengths)
+    assert distinct.shape == (6, 4, 3)
+    answers = coma.in_every_step(torch.from_numpy(distinct), rows).numpy()
+    for k, length in enumerate(lengths):
+        assert np.array_equal(answers[: length + 1, k], inputs[: length + 1, k])
 
 
 # --- the targets ---
