@@ -51,10 +51,10 @@ WORLDS = {
 # Guesses, until the tuning rule has chosen for each world; the networks always have Adam.
 TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, exploration=0.2),
-    ("findtreasure", "adam"): dict(learning_rate=1e-3, exploration=0.2),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, exploration=0.1),
     ("gotogether", "adam"): dict(learning_rate=1e-3, exploration=0.2),
     ("movebox", "adam"): dict(learning_rate=3e-4, exploration=0.2),
-    ("pushbox", "adam"): dict(learning_rate=1e-3, exploration=0.2),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, exploration=0.5),
 }
 # The lowest and highest value of every number that makes sense.
 LIMITS = dict(
