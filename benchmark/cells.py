@@ -29,6 +29,7 @@ METHODS = {
     "acer": "ACER",
     "dqn": "DQN",
     "edti": "EDTI",
+    "decespg_ex2": "DecESPG+EX2",
     "espg_icm": "ESPG+ICM",
     "espg_emi": "ESPG+EMI",
     "gasil": "GASIL",

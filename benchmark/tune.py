@@ -40,7 +40,14 @@ BETAS = {
     "cleaner": (0.01, 0.03, 0.1),
     "movebox": (0.03, 0.1, 0.3),
 }
-# Bonuses that are errors of learnt models have other scales.
+# The bonuses of learnt models have other scales.
+EXEMPLAR_BETAS = {
+    "findtreasure": (0.003, 0.01, 0.03),
+    "pushbox": (0.1, 0.3, 1.0),
+    "gotogether": (0.003, 0.01, 0.03),
+    "cleaner": (0.001, 0.003, 0.01),
+    "movebox": (0.003, 0.01, 0.03),
+}
 CURIOSITY_BETAS = {
     "findtreasure": (0.1, 0.3, 1.0),
     "pushbox": (1.0, 3.0, 10.0),
@@ -67,6 +74,7 @@ OWN = {
     "acer": ("critic_learning_rate", dict.fromkeys(EPISODES, (3e-4, 1e-3, 3e-3))),
     "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
+    "decespg_ex2": ("beta", EXEMPLAR_BETAS),
     "espg_icm": ("beta", CURIOSITY_BETAS),
     "espg_emi": ("beta", EMBEDDING_BETAS),
     "gasil": (

@@ -338,12 +338,12 @@ def test_tensorboard_shows_the_means_between_its_points(finished):
         "acer": ["value", "trust_region"],
         "dqn": ["epsilon", "value"],
         "gasil": [*bonus, "d_good", "d_own"],
+        "decespg_ex2": ["bonus", "cross_entropy", "overvisited"],
     }
     usual = ["episodic_return", "episodic_length", "reward_per_step", "SPS"]
     for k in range(2):
         shown = curves(finished.directory / f"seed{5 + k}")
-        if finished.name in own:
-            assert shown.keys() == {f"charts/{tag}" for tag in usual + own[finished.name]}
+        assert shown.keys() == {f"charts/{tag}" for tag in usual + own[finished.name]}
         assert all([step for step, _ in points] == [100, 200] for points in shown.values())
         returns, lengths = (episodes[which][k, :200].reshape(2, 100) for which in ("returns", "lengths"))
         expected = {
@@ -672,6 +672,15 @@ BAD_INPUT_OF = {
         "--batch-size 0": "--batch-size must be a number of at least 1, not 0",
         "--train-every 0": "--train-every must be a number of at least 1, not 0",
         "--target-every 0": "--target-every must be a number of at least 1, not 0",
+    },
+    "decespg_ex2": {
+        **BAD_MEMORY,
+        "--beta -1": "--beta must be a number of at least 0, not -1",
+        "--discriminator-learning-rate -1": "--discriminator-learning-rate must be a number of at least 0, not -1",
+        "--kl-weight -1": "--kl-weight must be a number of at least 0, not -1",
+        "--exemplars 0": "--exemplars must be a number of at least 1, not 0",
+        "--buffer-size 0": "--buffer-size must be a number of at least 1, not 0",
+        "--min-replay 0": "--min-replay must be a number of at least 1, not 0",
     },
     "espg_emi": {
         **BAD_MEMORY,
