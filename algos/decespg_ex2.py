@@ -73,7 +73,7 @@ HIDDEN, CODE = 32, 8
 LIMITS = dict(
     **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
     **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
-    **dict(beta=(0, np.inf), discriminator_learning_rate=(0, np.inf), kl_weight=(0, np.inf), exemplars=(1, np.inf)),
+    **dict(beta=(0, np.inf), exemplar_learning_rate=(0, np.inf), kl_weight=(0, np.inf), exemplars=(1, np.inf)),
     **dict(buffer_size=(1, np.inf), min_replay=(1, np.inf)),
     **dict(slots=(0, np.inf)),
 )
@@ -121,7 +121,7 @@ class Args:
     """with --evaluate: take the likeliest actions instead of drawing from the policies"""
     beta: float | None = None
     """weight of the exploration bonus, in units of reward (beta of Eq. 9; None: tuned for world and optimiser)"""
-    discriminator_learning_rate: float = 1e-2
+    exemplar_learning_rate: float = 1e-2
     """step size of the discriminators, which always have a persistent Adam (1e-4 in the published code, which fits more)"""
     kl_weight: float = 0.001
     """weight of the codes' divergence from a standard normal in the discriminators' loss (as in the published doom.py)"""
@@ -359,7 +359,7 @@ class ExemplarNovelty:
         """init and learn are the generators of all trials: of the first weights, and of batches and noise."""
         self.args, self.learn = args, learn
         self.discriminator = ExemplarDiscriminator(init, num_windows, pair_dim)
-        self.optimizer = StackedOptimizer(self.discriminator.params, "adam", args.discriminator_learning_rate)
+        self.optimizer = StackedOptimizer(self.discriminator.params, "adam", args.exemplar_learning_rate)
         self.buffer = np.zeros((len(init), num_windows, args.buffer_size, pair_dim), np.float32)  # visit n in row n mod size
         self.visits = np.zeros(len(init), np.int64)
         self.state = [*self.discriminator.params, *self.optimizer.state, self.buffer, self.visits]

@@ -31,7 +31,7 @@ def generators(*seeds):
 
 def novelty(trials=1, windows=1, dim=4, **args):
     torch.set_num_threads(1)  # as in `train`: on a busy machine threads wait for each other in every small product
-    default = dict(discriminator_learning_rate=1e-2, kl_weight=1e-3, exemplars=32, buffer_size=20_000, min_replay=1)
+    default = dict(exemplar_learning_rate=1e-2, kl_weight=1e-3, exemplars=32, buffer_size=20_000, min_replay=1)
     init, learn = generators(*range(trials)), generators(*range(50, 50 + trials))
     return decespg_ex2.ExemplarNovelty(SimpleNamespace(**default | args), init, learn, windows, dim)
 
@@ -127,7 +127,7 @@ def test_every_fit_and_bonus_is_that_of_a_plain_loop(env, tmp_path, monkeypatch)
         decespg_ex2,
         tmp_path,
         **dict(env=env, seed=2, num_trials=trials, num_episodes=10, max_steps=13, beta=0.5, log_every=1),
-        **dict(discriminator_learning_rate=0.05, kl_weight=kl_weight, exemplars=exemplars, buffer_size=size, min_replay=enough),
+        **dict(exemplar_learning_rate=0.05, kl_weight=kl_weight, exemplars=exemplars, buffer_size=size, min_replay=enough),
     )
     agents, past, checked, clamped = 2, {}, 0, []
     shown = [curves(tmp_path / f"seed{2 + k}") for k in range(trials)]
@@ -188,7 +188,7 @@ def test_every_fit_and_bonus_is_that_of_a_plain_loop(env, tmp_path, monkeypatch)
 
 def test_the_discriminators_have_a_persistent_adam(tmp_path, monkeypatch):
     episodes = watch(monkeypatch)
-    args = dict(env="pushbox", max_steps=12, min_replay=20, discriminator_learning_rate=0.01)
+    args = dict(env="pushbox", max_steps=12, min_replay=20, exemplar_learning_rate=0.01)
     train(decespg_ex2, tmp_path, num_trials=1, num_episodes=20, **args)
     fits = [fit for episode in episodes for fit in episode.fits]
     reference = [param.clone() for param in fits[0].params]

@@ -676,7 +676,7 @@ BAD_INPUT_OF = {
     "decespg_ex2": {
         **BAD_MEMORY,
         "--beta -1": "--beta must be a number of at least 0, not -1",
-        "--discriminator-learning-rate -1": "--discriminator-learning-rate must be a number of at least 0, not -1",
+        "--exemplar-learning-rate -1": "--exemplar-learning-rate must be a number of at least 0, not -1",
         "--kl-weight -1": "--kl-weight must be a number of at least 0, not -1",
         "--exemplars 0": "--exemplars must be a number of at least 1, not 0",
         "--buffer-size 0": "--buffer-size must be a number of at least 1, not 0",
