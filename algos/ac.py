@@ -47,7 +47,7 @@ WORLDS = {
     "movebox": dict(hidden=(256, 128), gamma=0.999, max_steps=200, num_episodes=20_000),
     "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
 }
-# Guesses for each world and optimiser, until the tuning rule has chosen.
+# The tuning rule's choice for each world and optimiser (benchmark/tuning/ac.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),

@@ -48,7 +48,7 @@ WORLDS = {
     "movebox": dict(hidden=(256, 128), gamma=0.999, max_steps=200, num_episodes=20_000),
     "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
 }
-# Guesses, until the tuning rule has chosen for each world; the networks always have Adam.
+# The tuning rule's choice for each world (benchmark/tuning/dqn.csv), guesses where it has no row yet; it is always Adam's.
 TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, exploration=0.2),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, exploration=0.1),
