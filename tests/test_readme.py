@@ -1,4 +1,4 @@
-"""The README's commands and its worked example do what it says."""
+"""The commands of README and docs/ and the worked example do what they say."""
 
 import re
 import shlex
@@ -11,8 +11,8 @@ import pytest
 import envs
 
 ROOT = Path(envs.__file__).parents[1]
-README = (ROOT / "README.md").read_text()
-BLOCKS = re.findall(r"```(bash|python)\n(.*?)```", README, re.DOTALL)
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = [block for text in TEXTS for block in re.findall(r"```(bash|python)\n(.*?)```", text.read_text(), re.DOTALL)]
 COMMANDS = [line for kind, block in BLOCKS if kind == "bash" for line in block.splitlines()]
 
 
