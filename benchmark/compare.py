@@ -115,14 +115,8 @@ class Job:
     """A cell that is being run: its process, and how it ended."""
 
     def __init__(self, cell, checkpoint_every):
-        self.cell, self.checkpoint_every, self.process, self.code, self.seconds, self.stopped = (
-            cell,
-            checkpoint_every,
-            None,
-            None,
-            0.0,
-            False,
-        )
+        self.cell, self.checkpoint_every = cell, checkpoint_every
+        self.process, self.code, self.seconds, self.stopped = None, None, 0.0, False
 
     def run(self):
         """Run the cell from where it stands, unless it is finished; waits for another process that runs it already."""
