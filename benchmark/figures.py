@@ -27,6 +27,7 @@ DASHES = {
     "decespg_ex2": "--",
     "espg_icm": "-.",
     "espg_emi": ":",
+    "gasil": "--",
 }
 FIGURES = {
     "figure3": ("pg", "ac", "coma", "acer", "dqn", "edti", "espg", "decespg"),
