@@ -74,7 +74,7 @@ def draw(curves, worlds, path):
         axis.set_title(world, fontsize="medium")
         axis.set_xlabel("visit to the same pair")
         axis.set_ylabel("bonus / largest")
-    axes[0, -1].legend(frameon=False, fontsize="small")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center", frameon=False)
     figure.savefig(path, dpi=130)
 
 
@@ -92,14 +92,14 @@ def main(
         num_trials: trials of each script
         num_episodes: episodes of each trial
     """
-    curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th", "10th : 1st", "100th : 1st"]]
+    curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th"]]
     for method in methods:
         for world in worlds:
             bonuses = curves[method, world] = bonuses_of_visits(
                 method, dict(env=world, num_trials=num_trials, num_episodes=num_episodes)
             )
             first, tenth, hundredth = (bonuses[:, n - 1].mean() for n in (1, 10, VISITS))
-            figures = [f"{value:.3g}" for value in (first, tenth, hundredth, tenth / first, hundredth / first)]
+            figures = [f"{value:.2f}" for value in (first, tenth, hundredth)]
             rows.append([method, world, str(len(bonuses)), *figures])
     draw(curves, worlds, ROOT / "docs" / "novelty.png")
     print(markdown(rows))
