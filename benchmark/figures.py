@@ -69,8 +69,9 @@ def learning_curves(results, methods):
     """The paper's Figures 3, 4 and 6: mean and standard error over trials, the exact optimum as a line."""
 
     def draw(axis, world, method, result):
+        if not axis.lines:
+            axis.axhline(statistics.optimum(world), color="black", linewidth=0.8, linestyle=":", label="exact optimum")
         line(axis, method, *statistics.mean_and_error(result.score))
-        axis.axhline(statistics.optimum(world), color="black", linewidth=0.8, linestyle=":", label="exact optimum")
 
     return panels(results, methods, f"reward per step (mean of {BLOCK} episodes)", draw)
 
@@ -99,7 +100,7 @@ def intervals(estimates, xlabel):
         axis.invert_yaxis()
         axis.grid(axis="x", alpha=0.3)
         axis.set_title(optimizer, fontsize="medium")
-        axis.set_xlabel(xlabel)
+    figure.supxlabel(xlabel, fontsize="medium")
     return figure
 
 

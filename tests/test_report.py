@@ -38,7 +38,7 @@ def test_curves_show_mean_error_and_optimum(kept):
     result = kept["pushbox", "pg", "sign"]
     drawn = figures.learning_curves({("pushbox", "pg", "sign"): result}, ("pg", "spg"))
     axis = next(axis for axis in drawn.axes if axis.get_title() == "pushbox, sign")
-    mean, optimum = axis.lines
+    optimum, mean = axis.lines
     assert np.allclose(mean.get_ydata(), result.score.mean(0))
     assert mean.get_xdata()[[0, -1]].tolist() == [100, result.num_episodes]
     assert optimum.get_ydata() == pytest.approx([100 / 3] * 2)
