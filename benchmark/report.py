@@ -29,7 +29,7 @@ HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-widt
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 1300px; margin: 0 auto; padding: 1rem; }
 h1 { line-height: 1.2; } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; height: auto; } .wide { overflow-x: auto; } .wide img { max-width: none; min-width: 44rem; width: 100%; }
+img { max-width: 100%; height: auto; } .wide { overflow-x: auto; } .wide img { min-width: 40rem; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
 td, th { padding: 0.2rem 0.6rem; border-bottom: 1px solid #e4e4e4; text-align: left; white-space: nowrap; }
 .teams { display: flex; flex-wrap: wrap; gap: 1rem; } figure { margin: 0; } figcaption { font-size: 0.85rem; }
@@ -166,7 +166,7 @@ def team_films(found, methods=("pg", "decespg"), optimizer="sign", longest=200):
                 continue
             world = envs.make_world(world_name)
             states = figures.episode_states(world, result.actions[:longest])
-            frames = [envs.draw(world, state, cell=24, caption=f"step {t}") for t, state in enumerate(states)]
+            frames = [envs.draw(world, state, cell=32, caption=f"step {t}") for t, state in enumerate(states)]
             words = f"{METHODS[method]} in {world_name}, {len(result.actions)} steps"
             with tempfile.TemporaryDirectory() as folder:
                 envs.save_gif(film := Path(folder) / "team.gif", frames)
