@@ -150,7 +150,7 @@ def plain_loss(own, steps, num_actions, args):
     mean = psi.sum(0) / size
     covariance = sum(torch.outer(psi[b] - mean, psi[b] - mean) for b in range(size)) / (size - 1)
     eigenvalues = torch.linalg.eigvalsh(covariance)
-    if float(eigenvalues.min()) > 1e-6:
+    if float(eigenvalues.detach().min()) > 1e-6:
         gaussian = (covariance.trace() + mean @ mean - dim - torch.logdet(covariance)) / 2
     else:  # too few different actions
         eigenvalues = eigenvalues.clamp(min=1e-6)

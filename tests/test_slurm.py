@@ -62,20 +62,25 @@ def test_a_requeued_task_and_a_lost_node_change_nothing(slurm, tmp_path):
     def says(what):
         return slurm("squeue", "-h", "-r", "-j", task, "-o", what)
 
+    def comes_back(node):
+        """Ask for it while the node is down; it may have come back by itself (ReturnToService)."""
+        down = "down" in slurm("sinfo", "-h", "-n", node, "-o", "%T")
+        if down:
+            slurm("scontrol", "update", f"NodeName={node}", "State=RESUME")
+        return not down
+
     def interrupt(*command):
-        """Interrupt the task after 100 more episodes; it waits to be started again."""
+        """Interrupt the task after 100 more episodes; Slurm starts it again after some seconds."""
         last = compare.progress(decespg)
         wait_until(lambda: compare.progress(decespg) >= last + 100, 90)
         slurm("scontrol", *command)
         wait_until(lambda: says("%T") == "PENDING", 30)
 
     interrupt("requeue", task)
-    slurm("scontrol", "update", f"JobId={task}", "StartTime=now")
     wait_until(lambda: says("%T") == "RUNNING", 30)
     node = says("%N")
     interrupt("update", f"NodeName={node}", "State=DOWN", "Reason=test")
-    slurm("scontrol", "update", f"NodeName={node}", "State=RESUME")
-    slurm("scontrol", "update", f"JobId={task}", "StartTime=now")
+    wait_until(lambda: comes_back(node), 30)
     wait_until(lambda: pg.finished and decespg.finished, 120)
 
     assert decespg.log.read_text().count(" 0/2000 [") == 1  # it never began anew
