@@ -27,12 +27,14 @@ class Result:
     actions: np.ndarray  # [T, num_agents] an episode of the first trial's trained team; T is 0 if the team was not saved
     seconds: float  # that the run took; nan if nobody has timed it
     num_episodes: int
-    about: dict  # args.json
+    about: dict  # args.json but for what does not concern the result, such as directories
 
     @classmethod
     def of_run(cls, run_dir):
         """Read a finished run's directory."""
         about = json.loads((run_dir / "args.json").read_text())
+        housekeeping = script(about["method"]).HOUSEKEEPING
+        about["args"] = {name: value for name, value in about["args"].items() if name not in housekeeping}
         world = envs.make_world(about["args"]["env"])
         with np.load(run_dir / "episodes.npz") as episodes:
             log = envs.EpisodeLog(world, *episodes["returns"].shape)

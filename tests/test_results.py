@@ -50,6 +50,8 @@ def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     assert result.last == pytest.approx(score[:, -12:].mean(1))
     assert result.usual[5] == np.bincount(outcomes[5, -12:]).argmax()
     assert (result.num_episodes, result.seconds) == (250, 12.5)
+    assert result.about["args"]["learning_rate"] == Cell("pg", "pushbox", "adam").settings["learning_rate"]
+    assert "run_dir" not in result.about["args"]
 
 
 def test_a_result_is_loaded_as_it_was_saved(tmp_path):
