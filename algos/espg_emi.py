@@ -16,8 +16,7 @@ for continuous actions rewards diversity instead). What has to be chosen here:
   per agent, as its place has (there 2 for one agent).
 - There, 3 epochs of minibatches of 512 follow every 100 000 steps of play. Here an episode may have 3 steps, of which a
   covariance is singular and no marginal can be had. So a minibatch of 64 is drawn after each episode from the last 4000 steps,
-  the first when 64 have been seen. Every step of play is then used as often as by 3 epochs where episodes last 21 steps. A
-  minibatch takes about as long as all else that decespg.py does without its bonus.
+  the first when 64 have been seen. Every step of play is then used as often as by 3 epochs where episodes last 21 steps.
 - These are fewer steps of Adam, so they are 0.003 long (there 0.001): under random play in findtreasure ||e||^2 comes to rest
   after 250 of them instead of 700, at the same value.
 - w_S leaves S about 1 % of what phi and psi cannot say, so steps into a wall or a teammate go on to earn a bonus.

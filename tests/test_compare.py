@@ -17,13 +17,13 @@ from benchmark import compare
 from benchmark.cells import ROOT, Cell, select
 from tests.helpers import assert_one_sentence, script
 
-BLOCK = dict(first_seed=5, num_trials=2, num_episodes=1500)
+BLOCK = dict(first_seed=5, num_trials=2, num_episodes=6000)
 
 
 def start(runs, *words):
     """Start ./benchmark.sh on two small cells, with a checkpoint after every episode; words may be more options."""
     selected = (
-        "--algos pg decespg --envs findtreasure --optimizers sign --seeds 5-6 --episodes 1500 --jobs 2 --checkpoint-every 0"
+        "--algos pg decespg --envs findtreasure --optimizers sign --seeds 5-6 --episodes 6000 --jobs 2 --checkpoint-every 0"
     )
     command = [ROOT / "benchmark.sh", *selected.split(), "--runs", runs, *words]
     environment = {**os.environ, "PYTHON": sys.executable}
@@ -112,7 +112,7 @@ def test_a_polite_stop_leaves_checkpoints(tmp_path):
     assert "0 failed" in said
     assert compare.state(decespg) == "stopped"
     assert re.search(
-        r"findtreasure/decespg/\S+ +stopped +\d+ of 1500 episodes", start(tmp_path, "--status").communicate(timeout=300)[0]
+        r"findtreasure/decespg/\S+ +stopped +\d+ of 6000 episodes", start(tmp_path, "--status").communicate(timeout=300)[0]
     )
 
 

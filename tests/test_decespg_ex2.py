@@ -201,6 +201,13 @@ def test_the_discriminators_have_a_persistent_adam(tmp_path, monkeypatch):
     assert len(fits) > 10
 
 
+def test_the_codes_begin_apart_and_with_little_noise():
+    codes = novelty(dim=4).discriminator.codes(torch.eye(4)[None], torch.eye(4)[None])
+    mean, log_variance = (part.detach() for part in codes)  # [1, 4, 2 * CODE]
+    assert mean.std(1).mean() > 0.3
+    assert float(log_variance.mean()) == pytest.approx(-4, abs=0.5)
+
+
 def test_the_divergence_is_that_of_closed_forms():
     """mean 0, variance 1: 0; mean m: m^2 / 2 for every number of a code; log variance v: (exp(v) - 1 - v) / 2."""
     bonus = novelty(dim=3)

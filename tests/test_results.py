@@ -165,8 +165,12 @@ def test_the_pace_of_what_nobody_has_timed_is_guessed_from_pg():
         ("pushbox", "spg", "adam"): some_result([], seconds=600.0, num_episodes=1000),
         ("movebox", "pg", "sign"): some_result([], seconds=5000.0, num_episodes=1000),
         ("movebox", "epg", "sign"): some_result([]),
+        ("cleaner", "spg", "sign"): some_result([], seconds=9000.0, num_episodes=1000),
     }
     pace = results.seconds_per_episode(found)
     assert pace["pg", "pushbox"] == pytest.approx(0.2)
     assert pace["spg", "movebox"] == pytest.approx(15)
     assert pace["epg", "movebox"] == pytest.approx(5)
+    assert pace["pg", "cleaner"] == pytest.approx(3)
+    assert pace["spg", "cleaner"] == pytest.approx(9)
+    assert pace["epg", "gotogether"] == 0.01

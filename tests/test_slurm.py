@@ -17,7 +17,7 @@ from benchmark.cells import ROOT, select
 
 MISSING = [name for name in ("munged", "slurmctld", "slurmd", "sbatch") if shutil.which(name) is None]
 pytestmark = pytest.mark.skipif(bool(MISSING), reason="Slurm is not installed (Debian: slurm-wlm and munge)")
-SELECTION = "--algos pg decespg --envs findtreasure --optimizers sign --seeds 5 --episodes 2000 --checkpoint-every 0"
+SELECTION = "--algos pg decespg --envs findtreasure --optimizers sign --seeds 5 --episodes 6000 --checkpoint-every 0"
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def wait_until(condition, seconds):
 
 
 def cells(runs):
-    block = dict(first_seed=5, num_trials=1, num_episodes=2000)
+    block = dict(first_seed=5, num_trials=1, num_episodes=6000)
     return select(["pg", "decespg"], ["findtreasure"], ["sign"], **block, runs=runs)
 
 
@@ -83,7 +83,7 @@ def test_a_requeued_task_and_a_lost_node_change_nothing(slurm, tmp_path):
     wait_until(lambda: comes_back(node), 30)
     wait_until(lambda: pg.finished and decespg.finished, 120)
 
-    assert decespg.log.read_text().count(" 0/2000 [") == 1  # it never began anew
+    assert decespg.log.read_text().count(" 0/6000 [") == 1  # it never began anew
     assert "Restarts=2" in slurm("scontrol", "-o", "show", "job", task)
     for here, there in zip(cells(tmp_path / "here"), (pg, decespg), strict=True):
         with np.load(here.run_dir / "episodes.npz") as expected, np.load(there.run_dir / "episodes.npz") as found:
