@@ -9,12 +9,13 @@ Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and
 no setting of EX2. Model and loss are those of Fu, Co-Reyes & Levine, "EX2: Exploration with Exemplar Models for Deep
 Reinforcement Learning" (NIPS 2017), amortised over exemplars, and of the published code (jcoreyes/ex2): pairs with actions and
 -log p as in its pointmass.py, kl_weight as in doom.py, min_replay as in atari.py. That fits 1000 times to 128 exemplars after
-every 4000 steps, at a step size of 1e-4, which would take most of the time here. So an episode of T steps is followed by T / 8
-fits to 32 exemplars at 1e-2, and the networks are smaller. With so little fitting the kl_weight 0.01 of pointmass.py held D at
-1/2, which is no bonus at all, and it matters where the networks begin: with weights of unit gain and little noise in the codes
-the bonus of random play in pushbox goes along with the true -log p at a correlation of 0.6, instead of 0.3. The bonus lies in
-[0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike there the first fit is no longer than
-others, and the bonus' median is not subtracted.
+every 4000 steps, at a step size of 1e-4, which would take most of the time here. So the networks are smaller, and fits are to
+32 exemplars at 1e-2: four after each of the first 1000 episodes, and one after every fifth of the others, which are short. In
+pushbox the bonus then goes along with the true -log p at a correlation of 0.7 after 500 episodes and 0.8 after 1000, as with a
+fit for every 8 steps of play; with one fit for each episode at 0.3 and 0.6. With so little fitting the kl_weight 0.01 of
+pointmass.py held D at 1/2, which is no bonus at all, and it matters where the networks begin: weights of unit gain, and little
+noise in the codes. The bonus lies in [0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike
+there its median is not subtracted.
 
     python algos/decespg_ex2.py --env pushbox --seed 3
 """
@@ -37,7 +38,7 @@ import numpy as np
 import torch
 import tyro
 from numba import njit
-from torch.nn.functional import binary_cross_entropy_with_logits
+from torch.nn.functional import softplus
 from torch.utils.tensorboard import SummaryWriter
 from tqdm import tqdm
 
@@ -333,6 +334,11 @@ def merge_steps(obs, actions, weights, lengths, num_actions):
     return distinct[:, :most].copy(), weight[:, :most].astype(np.float32)
 
 
+def fits_after(episode):
+    """How often the discriminators are fitted after an episode: most while the teams still explore, whose episodes are long."""
+    return 4 if episode < 1000 else int(episode % 5 == 0)
+
+
 class ExemplarDiscriminator:
     """D(u*, u), the probability that u is the exemplar u* itself and not an earlier pair; side by side for all windows.
 
@@ -348,27 +354,28 @@ class ExemplarDiscriminator:
         for encoder in self.encoders:
             encoder.params[-1].data[..., CODE:] = -4.0  # the log variances: at first the noise does not hide the codes
 
-    def codes(self, exemplars, others):
-        """Means and log variances of both codes, [num_nets, batch, 2 * CODE], of pairs [num_nets, batch, pair_dim] each."""
-        heads = [encoder(pairs).chunk(2, dim=-1) for encoder, pairs in zip(self.encoders, (exemplars, others), strict=True)]
-        return [torch.cat(both, dim=-1) for both in zip(*heads, strict=True)]
+    def losses(self, exemplars, earlier, noise):
+        """Mean cross entropy of a batch, and mean divergence KL(N(mean, variance) || N(0, 1)) of both codes, [num_nets] each.
 
-    def losses(self, exemplars, others, labels, noise):
-        """Mean cross entropy and mean divergence KL(N(mean, variance) || N(0, 1)) of both codes in each batch, [num_nets] each.
-
-        labels [num_nets, batch] are 1 where u is the exemplar and else 0; noise [num_nets, batch, 2 * CODE] is standard normal.
+        Every exemplar is paired with itself and with an earlier pair; exemplars and earlier [num_nets, batch, pair_dim].
+        noise [num_nets, 3 * batch, CODE], standard normal, is for the codes of the exemplars as u*, as u, and of the earlier.
         """
-        mean, log_variance = self.codes(exemplars, others)
-        logits = self.classifier(mean + (log_variance / 2).exp() * noise)[..., 0]
-        cross_entropy = binary_cross_entropy_with_logits(logits, labels.to(logits), reduction="none")
-        divergence = 0.5 * (mean**2 + log_variance.exp() - 1 - log_variance).sum(-1)
-        return cross_entropy.mean(-1), divergence.mean(-1)
+        first, second = self.encoders[0](exemplars), self.encoders[1](torch.cat([exemplars, earlier], dim=1))
+        mean, log_variance = torch.cat([first, second], dim=1).chunk(2, dim=2)
+        deviation = (log_variance / 2).exp()
+        exemplar, same, other = (mean + deviation * noise).chunk(3, dim=1)
+        codes = torch.cat([torch.cat([exemplar, same], dim=2), torch.cat([exemplar, other], dim=2)], dim=1)
+        of_same, of_other = self.classifier(codes)[..., 0].chunk(2, dim=1)
+        cross_entropy = (softplus(-of_same) + softplus(of_other)).mean(1) / 2  # -log D and -log(1 - D)
+        divergence = 0.5 * (mean**2 + deviation**2 - 1 - log_variance).sum(2)
+        exemplar, same, other = divergence.chunk(3, dim=1)
+        return cross_entropy, (exemplar + (same + other) / 2).mean(1)
 
     @torch.no_grad()
     def surprise(self, pairs):
         """-log p(u) = log D(u, u) / (1 - D(u, u)) of pairs [num_nets, batch, pair_dim], from the means of the codes."""
-        mean, _ = self.codes(pairs, pairs)
-        return self.classifier(mean)[..., 0]
+        means = [encoder(pairs).chunk(2, dim=2)[0] for encoder in self.encoders]
+        return self.classifier(torch.cat(means, dim=2))[..., 0]
 
 
 class ExemplarNovelty:
@@ -381,55 +388,53 @@ class ExemplarNovelty:
         self.optimizer = StackedOptimizer(self.discriminator.params, "adam", args.exemplar_learning_rate)
         self.buffer = np.zeros((len(init), num_windows, args.buffer_size, pair_dim), np.float32)  # visit n in row n mod size
         self.visits = np.zeros(len(init), np.int64)
-        self.state = [*self.discriminator.params, *self.optimizer.state, self.buffer, self.visits]
+        self.cross_entropy = np.full(len(init), np.log(2))  # mean of the last fits; before the first, that of D = 1/2
+        self.state = [*self.discriminator.params, *self.optimizer.state, self.buffer, self.visits, self.cross_entropy]
 
-    def bonus(self, pairs, lengths):
+    def bonus(self, pairs, lengths, fits):
         """EB = -log p(u) of each pair u of an episode, [T, num_trials, num_windows]; first fit, then remember, then judge.
 
         It is 0 until the discriminators have been fitted, which takes `min_replay` earlier pairs. Also returns the mean cross
-        entropy of the fits (log 2, which is that of D = 1/2, before there are any) and the share of pairs with D < 1/2.
+        entropy of the last fits and the share of pairs with D < 1/2, both [num_trials].
         """
-        fits = np.where(self.visits < self.args.min_replay, 0, np.maximum(lengths // 8, 1))
-        cross_entropy = self.fit(pairs, lengths, fits)
+        enough = self.visits >= self.args.min_replay
+        if fits and enough.any():
+            self.fit(pairs, lengths, fits, enough)
         self.remember(pairs, lengths)
         steps, trials, windows, dim = pairs.shape
         nets_first = torch.from_numpy(pairs).permute(1, 2, 0, 3).reshape(trials * windows, steps, dim)
         surprise = self.discriminator.surprise(nets_first).double().numpy().reshape(trials, windows, steps).transpose(2, 0, 1)
-        judged = ((np.arange(steps)[:, None] < lengths) & (fits > 0))[:, :, None]
+        fitted = self.optimizer.count[::windows] > 0
+        judged = ((np.arange(steps)[:, None] < lengths) & fitted)[:, :, None]
         bonus = np.where(judged, surprise.clip(0, np.log(1e5 - 1)), 0.0)
-        return bonus, cross_entropy, (judged & (surprise < 0)).sum((0, 2)) / (lengths * windows)
+        return bonus, self.cross_entropy, (judged & (surprise < 0)).sum((0, 2)) / (lengths * windows)
 
-    def fit(self, pairs, lengths, fits):
-        """fits [num_trials] steps of Adam for each trial's discriminators; returns their mean cross entropy [num_trials]."""
-        exemplars, earlier, noise = self.draw(pairs, lengths, fits)
-        labels = torch.cat([torch.ones(exemplars.shape[1:3]), torch.zeros(earlier.shape[1:3])], dim=1)
-        windows = self.buffer.shape[1]
-        total = torch.zeros(len(fits) * windows)
-        for n in range(fits.max()):
-            first, second = torch.cat([exemplars[n], exemplars[n]], dim=1), torch.cat([exemplars[n], earlier[n]], dim=1)
-            cross_entropy, divergence = self.discriminator.losses(first, second, labels, noise[n])
+    def fit(self, pairs, lengths, fits, enough):
+        """Several steps of Adam for the discriminators of the trials in the mask `enough`."""
+        windows, total = self.buffer.shape[1], 0.0
+        active = torch.from_numpy(np.repeat(enough, windows))
+        for exemplars, earlier, noise in zip(*self.draw(pairs, lengths, fits, enough), strict=True):
+            cross_entropy, divergence = self.discriminator.losses(exemplars, earlier, noise)
             loss = (cross_entropy + self.args.kl_weight * divergence).sum()
-            active = torch.from_numpy(np.repeat(n < fits, windows))
             self.optimizer.step(torch.autograd.grad(loss, self.discriminator.params), active)
-            total += cross_entropy.detach() * active
-        return np.where(fits > 0, total.view(-1, windows).mean(1).numpy() / np.maximum(fits, 1), np.log(2))
+            total += cross_entropy.detach().numpy()
+        self.cross_entropy[enough] = (total / fits).reshape(-1, windows).mean(1)[enough]
 
-    def draw(self, pairs, lengths, fits):
-        """The batches of all fits, drawn with each trial's own generator; 0 where a trial has fewer fits than another.
+    def draw(self, pairs, lengths, fits, enough):
+        """The batches of all fits, drawn with each trial's own generator; 0 for trials outside the mask `enough`.
 
         -> exemplars of the episode and earlier pairs, both [fits, num_nets, exemplars, pair_dim], and the noise of
-        the codes [fits, num_nets, 2 * exemplars, 2 * CODE]
+        the codes [fits, num_nets, 3 * exemplars, CODE]
         """
-        _, windows, size, dim = self.buffer.shape
-        shape = fits.max(), len(fits), windows, self.args.exemplars
-        exemplars, earlier = np.zeros((2, *shape, dim), np.float32)
-        noise = np.zeros((*shape[:3], 2 * self.args.exemplars, 2 * CODE), np.float32)
+        trials, windows, size, dim = self.buffer.shape
+        drawn = fits, windows, self.args.exemplars
+        exemplars, earlier = np.zeros((2, fits, trials, *drawn[1:], dim), np.float32)
+        noise = np.zeros((fits, trials, windows, 3 * self.args.exemplars, CODE), np.float32)
         each = np.arange(windows)[:, None]
-        for k in np.flatnonzero(fits):
-            own, drawn = slice(fits[k]), (fits[k], *shape[2:])
-            exemplars[own, k] = pairs[self.learn[k].integers(lengths[k], size=drawn), k, each]
-            earlier[own, k] = self.buffer[k, each, self.learn[k].integers(min(self.visits[k], size), size=drawn)]
-            noise[own, k] = self.learn[k].standard_normal((fits[k], *noise.shape[2:]), dtype=np.float32)
+        for k in np.flatnonzero(enough):
+            exemplars[:, k] = pairs[self.learn[k].integers(lengths[k], size=drawn), k, each]
+            earlier[:, k] = self.buffer[k, each, self.learn[k].integers(min(self.visits[k], size), size=drawn)]
+            noise[:, k] = self.learn[k].standard_normal(noise[:, k].shape, dtype=np.float32)
         return [torch.from_numpy(array).flatten(1, 2) for array in (exemplars, earlier, noise)]
 
     def remember(self, pairs, lengths):
@@ -527,7 +532,7 @@ def train(args: Args):
 
         # Augment each agent's reward with its own exploration bonus, Eq. 9, after fitting the models; remember the visits.
         pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
-        bonus, cross_entropy, overvisited = novelty.bonus(pairs, lengths)
+        bonus, cross_entropy, overvisited = novelty.bonus(pairs, lengths, fits_after(episode))
         augmented = reward + args.beta * bonus
 
         # Update the selective memory, by the original reward.

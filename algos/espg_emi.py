@@ -15,8 +15,9 @@ for continuous actions rewards diversity instead). What has to be chosen here:
 - phi, psi, S and the statistics T have one hidden layer of 64 (there 1 to 3 layers of 32 to 256). Embeddings have 2 dimensions
   per agent, as its place has (there 2 for one agent).
 - There, 3 epochs of minibatches of 512 follow every 100 000 steps of play. Here an episode may have 3 steps, of which a
-  covariance is singular and no marginal can be had. So a minibatch of 64 is drawn after each episode from the last 4000 steps,
-  the first when 64 have been seen. Every step of play is then used as often as by 3 epochs where episodes last 21 steps.
+  covariance is singular and no marginal can be had. So minibatches of 64 are drawn from the last 4000 steps, the first when 64
+  have been seen: one after each of the first 1000 episodes, which in findtreasure and pushbox last 19 and 27 steps, and one
+  after every fifth of the others, of 9 and 5 steps. So every step of play is used 1.4 to 3.4 times.
 - These are fewer steps of Adam, so they are 0.003 long (there 0.001): under random play in findtreasure ||e||^2 comes to rest
   after 250 of them instead of 700, at the same value.
 - w_S leaves S about 1 % of what phi and psi cannot say, so steps into a wall or a teammate go on to earn a bonus.
@@ -127,7 +128,7 @@ class Args:
     embedding_learning_rate: float = 3e-3
     """step size of the embeddings, which always have a persistent Adam"""
     embedding_batch: int = 64
-    """steps in the minibatch from which the embeddings learn after each episode; both halves of it have equally many"""
+    """steps in a minibatch from which the embeddings learn; both halves of it have equally many"""
     recent_steps: int = 4000
     """last steps of each trial, from which minibatches are drawn"""
     error_weight: float = 100.0
@@ -364,6 +365,11 @@ def squared_residual(phi, psi, next_phi, error):
     return (next_phi - phi - psi - error).square().sum(2)
 
 
+def learns_after(episode):
+    """Whether the model learns after an episode: always while the teams still explore, whose episodes are long."""
+    return episode < 1000 or episode % 5 == 0
+
+
 class EmbeddingNovelty:
     """The exploration bonus of EMI: one model for each trial, of all agents together, and the steps from which it learns."""
 
@@ -379,13 +385,15 @@ class EmbeddingNovelty:
         self.pairs = np.zeros((args.num_trials, args.recent_steps, choice + sight), np.float32)
         self.next_obs = np.zeros((args.num_trials, args.recent_steps, sight), np.float32)
         self.visits = np.zeros(args.num_trials, np.int64)  # visit number n is in row n mod recent_steps
-        self.state = [self.pairs, self.next_obs, self.visits]
+        self.figures = np.zeros((2, args.num_trials))  # what the last minibatch said of the model
+        self.state = [self.pairs, self.next_obs, self.visits, self.figures]
         for optimizer in self.optimizers:
             self.state += [*optimizer.params, *optimizer.state]
 
-    def bonus(self, pairs, lengths, next_obs):
-        """EB = ||e||^2 of each step of an episode, [T, num_trials, 1], 0 beyond its end; and what `fit` says, which follows.
+    def bonus(self, pairs, lengths, next_obs, learn):
+        """EB = ||e||^2 of each step of an episode, [T, num_trials, 1], 0 beyond its end; then learn from a minibatch, or not.
 
+        Also returns mean ||e||^2 / mean ||psi||^2 and 2 log 2 - (L_a + L_o) / 2 of the last minibatch, [num_trials] each.
         pairs [T, num_trials, 1, pair_dim], lengths [num_trials], next_obs [T, num_trials, 1, num_agents * obs_dim]
         """
         pairs, next_obs, during = pairs[:, :, 0], next_obs[:, :, 0], np.arange(len(pairs))[:, None] < lengths
@@ -397,7 +405,9 @@ class EmbeddingNovelty:
         rows = k, (self.visits[k] + t) % self.args.recent_steps
         self.pairs[rows], self.next_obs[rows] = pairs[t, k], next_obs[t, k]
         self.visits += lengths
-        return bonus, *self.fit()
+        if learn:
+            self.fit()
+        return bonus, *self.figures
 
     def embed(self, pairs, next_obs):
         """phi(o), psi(a), phi(o') and S(o, a) of steps, [num_trials, batch, d] each; both arguments [num_trials, batch, ..]."""
@@ -406,7 +416,7 @@ class EmbeddingNovelty:
         return phi, self.psi(actions.flatten(2)), next_phi, self.error(pairs)
 
     def fit(self):
-        """Learn from a minibatch, in each trial that has seen as many steps as are in it; the figures of `loss` before that."""
+        """Learn from a minibatch, in each trial that has seen as many steps as are in it."""
         held, size = np.minimum(self.visits, self.args.recent_steps), self.args.embedding_batch
         drawn = [generator.integers(count, size=size) for generator, count in zip(self.learn, held, strict=True)]
         rows = np.arange(len(held))[:, None], np.array(drawn)
@@ -416,7 +426,7 @@ class EmbeddingNovelty:
         active = torch.from_numpy(self.visits >= size)
         embeddings.step(grads[: len(embeddings.params)], active)
         statistics.step(grads[len(embeddings.params) :], active.repeat_interleave(2))
-        return [figure.detach().numpy() for figure in figures]
+        self.figures[:] = torch.stack(figures).detach()
 
     def loss(self, pairs, next_obs):
         """The loss of a minibatch, mean ||e||^2 / mean ||psi||^2 and 2 log 2 - (L_a + L_o) / 2, [num_trials] each.
@@ -533,7 +543,7 @@ def train(args: Args):
         pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
         pairs = pairs.reshape(longest, args.num_trials, 1, pair_dim)  # the team's u
         next_obs = rollout.obs[1 : longest + 1].reshape(longest, args.num_trials, 1, -1)
-        bonus, unexplained, information = novelty.bonus(pairs, lengths, next_obs)
+        bonus, unexplained, information = novelty.bonus(pairs, lengths, next_obs, learns_after(episode))
         augmented = reward + args.beta * bonus
 
         # Update the selective memory, by the original reward.

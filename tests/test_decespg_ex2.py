@@ -1,6 +1,7 @@
 """DecESPG with EX2: its discriminators against plain loops, closed forms and known densities, every update, and learning."""
 
 import copy
+from itertools import product
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -71,7 +72,7 @@ class Fit(NamedTuple):
 
 
 class Episode(NamedTuple):
-    """One call of `bonus`: what it was given and returned, what it drew, its fits, and the weights that judged."""
+    """One call of `bonus`: what it was given and returned, its generators before, its fits, and the weights that judged."""
 
     pairs: np.ndarray
     lengths: np.ndarray
@@ -79,14 +80,14 @@ class Episode(NamedTuple):
     cross_entropy: np.ndarray
     overvisited: np.ndarray
     learn: list
-    drawn: list
+    due: int
     fits: list
     params: list
 
 
 def watch(monkeypatch):
     """A list that gets every `Episode` from now on."""
-    episodes, fits, drawn = [], [], []
+    episodes, fits = [], []
     novelty = decespg_ex2.ExemplarNovelty
 
     class WatchedNovelty(novelty):
@@ -101,16 +102,12 @@ def watch(monkeypatch):
 
             self.optimizer.step = watched_step
 
-        def draw(self, *args):
-            drawn.append(super().draw(*args))
-            return drawn[-1]
-
-        def bonus(self, pairs, lengths):
+        def bonus(self, pairs, lengths, due):
             learn = copy.deepcopy(self.learn)
             fits.clear()
-            found = super().bonus(pairs, lengths)
+            found = super().bonus(pairs, lengths, due)
             params = [param.detach().clone() for param in self.discriminator.params]
-            episodes.append(Episode(pairs.copy(), lengths.copy(), *found, learn, drawn.pop(), [*fits], params))
+            episodes.append(Episode(pairs.copy(), lengths.copy(), *map(np.copy, found), learn, due, [*fits], params))
             return found
 
     monkeypatch.setattr(decespg_ex2, "ExemplarNovelty", WatchedNovelty)
@@ -121,69 +118,73 @@ def watch(monkeypatch):
 def test_every_fit_and_bonus_is_that_of_a_plain_loop(env, tmp_path, monkeypatch):
     """First the fits, against earlier pairs only; then the pairs are remembered; then they are judged."""
     use_double_precision(decespg_ex2, monkeypatch)
+    monkeypatch.setattr(decespg_ex2, "fits_after", lambda episode: (2, 2, 2, 2, 1, 0)[episode % 6])
     episodes = watch(monkeypatch)
     trials, size, exemplars, kl_weight, enough = 2, 25, 3, 0.3, 18
     train(
         decespg_ex2,
         tmp_path,
-        **dict(env=env, seed=2, num_trials=trials, num_episodes=10, max_steps=13, beta=0.5, log_every=1),
+        **dict(env=env, seed=2, num_trials=trials, num_episodes=14, max_steps=13, beta=0.5, log_every=1),
         **dict(exemplar_learning_rate=0.05, kl_weight=kl_weight, exemplars=exemplars, buffer_size=size, min_replay=enough),
     )
     agents, past, checked, clamped = 2, {}, 0, []
-    shown = [curves(tmp_path / f"seed{2 + k}") for k in range(trials)]
+    entropy_of, shown = [np.log(2)] * trials, [curves(tmp_path / f"seed{2 + k}") for k in range(trials)]
+    fitted = [False] * trials
     for number, episode in enumerate(episodes):
-        entropies = {}
-        due = []
+        assert len(episode.fits) in (episode.due, 0)
         for k, length in enumerate(episode.lengths):
             earlier = {i: past.get((k, i), np.zeros((0, episode.pairs.shape[-1]))) for i in range(agents)}
-            due.append(max(length // 8, 1) if len(earlier[0]) >= enough else 0)
-            if due[k]:
-                drawn = (due[k], agents, exemplars)
+            due, entropies = episode.due if len(earlier[0]) >= enough else 0, []
+            if due:
+                drawn = (due, agents, exemplars)
                 first = episode.learn[k].integers(length, size=drawn)
                 second = episode.learn[k].integers(min(len(earlier[0]), size), size=drawn)
-                noise = episode.learn[k].standard_normal((due[k], agents, 2 * exemplars, 2 * CODE), dtype=np.float32)
-            for n in range(due[k]):
-                fit = episode.fits[n]
-                for i in range(agents):
-                    net = k * agents + i
-                    assert fit.active[net]
-                    ring = np.zeros((size, episode.pairs.shape[-1]))
-                    for visit, pair in enumerate(earlier[i]):
-                        ring[visit % size] = pair
-                    own = own_weights(fit.params, net)
-                    cross_entropy, loss = 0.0, 0.0
-                    for row in range(2 * exemplars):
-                        exemplar = episode.pairs[first[n, i, row % exemplars], k, i]
-                        same = row < exemplars
-                        other = exemplar if same else ring[second[n, i, row - exemplars]]
-                        logit, divergence = plain_discriminator(own, exemplar, other, noise[n, i, row].reshape(2, CODE))
-                        d = torch.sigmoid(logit)
-                        cross_entropy -= torch.log(d if same else 1 - d) / (2 * exemplars)
-                        loss += kl_weight * divergence / (2 * exemplars)
-                    expected = torch.autograd.grad(loss + cross_entropy, own)
-                    for grad, plain in zip(fit.grads, expected, strict=True):
-                        assert np.allclose(grad[net], plain, rtol=1e-7, atol=1e-9)
-                    entropies.setdefault(k, []).append(cross_entropy.item())
-                    checked += 1
+                noise = episode.learn[k].standard_normal((due, agents, 3, exemplars, CODE), dtype=np.float32)
+                fitted[k] = True
+            for n, i in product(range(due), range(agents)):
+                net, fit = k * agents + i, episode.fits[n]
+                ring = np.zeros((size, episode.pairs.shape[-1]))
+                for visit, pair in enumerate(earlier[i]):
+                    ring[visit % size] = pair
+                own = own_weights(fit.params, net)
+                cross_entropy, loss = 0.0, 0.0
+                for same, row in product((True, False), range(exemplars)):
+                    exemplar = episode.pairs[first[n, i, row], k, i]
+                    other = exemplar if same else ring[second[n, i, row]]
+                    of_both = noise[n, i, [0, 1 if same else 2], row]
+                    logit, divergence = plain_discriminator(own, exemplar, other, of_both)
+                    d = torch.sigmoid(logit)
+                    cross_entropy -= torch.log(d if same else 1 - d) / (2 * exemplars)
+                    loss += kl_weight * divergence / (2 * exemplars)
+                expected = torch.autograd.grad(loss + cross_entropy, own)
+                for grad, plain in zip(fit.grads, expected, strict=True):
+                    assert np.allclose(grad[net], plain, rtol=1e-7, atol=1e-9)
+                entropies.append(cross_entropy.item())
+                checked += 1
+            assert all(bool(fit.active[k * agents + i]) == (due > 0) for fit in episode.fits for i in range(agents))
             for i in range(agents):
                 own = own_weights(episode.params, k * agents + i)
                 logits = [plain_discriminator(own, u, u)[0].item() for u in episode.pairs[:length, k, i]]
-                bonus = np.clip(logits, 0, HIGHEST) if due[k] else np.zeros(length)
+                bonus = np.clip(logits, 0, HIGHEST) if fitted[k] else np.zeros(length)
                 assert episode.bonus[:length, k, i] == pytest.approx(bonus, abs=1e-8)
                 assert not episode.bonus[length:, k, i].any()
-                clamped.append((np.array(logits) < 0) & (due[k] > 0))
+                clamped.append((np.array(logits) < 0) & fitted[k])
                 past[k, i] = np.concatenate([earlier[i], episode.pairs[:length, k, i]])
+            entropy_of[k] = np.mean(entropies) if due else entropy_of[k]
             assert episode.overvisited[k] == pytest.approx(np.mean(clamped[-agents:]))
-            assert episode.cross_entropy[k] == pytest.approx(np.mean(entropies[k]) if due[k] else np.log(2), abs=1e-6)
+            assert episode.cross_entropy[k] == pytest.approx(entropy_of[k], abs=1e-6)
             figures = dict(cross_entropy=episode.cross_entropy[k], overvisited=episode.overvisited[k])
             for tag, value in dict(figures, bonus=episode.bonus[:length, k].mean()).items():
                 assert shown[k][f"charts/{tag}"][number] == (number + 1, pytest.approx(value, abs=1e-6))
-        assert len(episode.fits) == max(due)
-        for n, fit in enumerate(episode.fits):
-            assert fit.active.tolist() == [n < count for count in due for _ in range(agents)]
     assert checked > 30
     assert max(map(len, past.values())) > 2 * size
     assert 0 < np.concatenate(clamped).mean() < 1
+
+
+def test_fits_are_most_while_teams_explore():
+    fits = [decespg_ex2.fits_after(episode) for episode in range(2000)]
+    assert fits[:1000] == [4] * 1000
+    assert fits[1000:] == [1, 0, 0, 0, 0] * 200
 
 
 def test_the_discriminators_have_a_persistent_adam(tmp_path, monkeypatch):
@@ -202,10 +203,10 @@ def test_the_discriminators_have_a_persistent_adam(tmp_path, monkeypatch):
 
 
 def test_the_codes_begin_apart_and_with_little_noise():
-    codes = novelty(dim=4).discriminator.codes(torch.eye(4)[None], torch.eye(4)[None])
-    mean, log_variance = (part.detach() for part in codes)  # [1, 4, 2 * CODE]
-    assert mean.std(1).mean() > 0.3
-    assert float(log_variance.mean()) == pytest.approx(-4, abs=0.5)
+    for encoder in novelty(dim=4).discriminator.encoders:
+        mean, log_variance = encoder(torch.eye(4)[None]).detach().chunk(2, dim=2)  # [1, 4, CODE]
+        assert mean.std(1).mean() > 0.3
+        assert float(log_variance.mean()) == pytest.approx(-4, abs=0.5)
 
 
 def test_the_divergence_is_that_of_closed_forms():
@@ -215,13 +216,12 @@ def test_the_divergence_is_that_of_closed_forms():
     with torch.no_grad():
         for param in bonus.discriminator.params:
             param.zero_()
-        u = torch.zeros(1, 5, 3), torch.ones(1, 5, 3)
-        labels, noise = torch.zeros(1, 5), torch.zeros(1, 5, 2 * CODE)
-        assert bonus.discriminator.losses(*u, labels, noise)[1].tolist() == [0]
+        batch = torch.zeros(1, 5, 3), torch.ones(1, 5, 3), torch.zeros(1, 15, CODE)
+        assert bonus.discriminator.losses(*batch)[1].tolist() == [0]
         first[3][0, 0, :CODE] = 2.0
-        assert bonus.discriminator.losses(*u, labels, noise)[1].tolist() == [CODE * 2]
+        assert bonus.discriminator.losses(*batch)[1].tolist() == [CODE * 2]
         second[3][0, 0, CODE:] = -3.0
-        cross_entropy, divergence = bonus.discriminator.losses(*u, labels, noise)
+        cross_entropy, divergence = bonus.discriminator.losses(*batch)
     assert divergence.item() == pytest.approx(CODE * (2 + (np.exp(-3) + 2) / 2), rel=1e-6)
     assert cross_entropy.item() == pytest.approx(np.log(2), rel=1e-6)
 
@@ -241,7 +241,7 @@ class Table(torch.nn.Module):
         exemplar, other = codes.chunk(2, dim=-1)
         return ((exemplar @ self.params[0]) * other).sum(-1, keepdim=True)
 
-    codes, losses, surprise = (getattr(decespg_ex2.ExemplarDiscriminator, name) for name in ("codes", "losses", "surprise"))
+    losses, surprise = (getattr(decespg_ex2.ExemplarDiscriminator, name) for name in ("losses", "surprise"))
 
 
 def table_novelty(cells, **args):
@@ -257,12 +257,10 @@ def test_a_free_table_finds_the_density_and_its_logarithm():
     bonus = table_novelty(5)
     exemplars = np.repeat(np.eye(5, dtype=np.float32), 20, axis=0)
     earlier = np.tile(np.repeat(np.eye(5, dtype=np.float32), (20 * p).round().astype(int), axis=0), (5, 1))
-    batch = [torch.from_numpy(each) for each in (exemplars, earlier, np.zeros((200, 10), np.float32))]
-    bonus.draw = lambda pairs, lengths, fits: [each.expand(int(fits.max()), 1, -1, -1) for each in batch]
+    batch = [torch.from_numpy(each) for each in (exemplars, earlier, np.zeros((300, 5), np.float32))]
+    bonus.draw = lambda pairs, lengths, fits, enough: [each.expand(fits, 1, -1, -1) for each in batch]
     bonus.visits[:] = 1
-    episode = np.zeros((4000, 1, 1, 5), np.float32)
-    episode[:5, 0, 0] = np.eye(5)
-    values, _, overvisited = bonus.bonus(episode, np.array([4000]))
+    values, _, overvisited = bonus.bonus(np.eye(5, dtype=np.float32)[:, None, None], np.array([5]), 500)
     with torch.no_grad():
         d = torch.sigmoid(bonus.discriminator.params[0][0].diagonal()).numpy()
     assert d[:4] == pytest.approx(1 / (1 + p[:4]), abs=1e-4)
@@ -277,7 +275,7 @@ def test_the_bonus_of_what_was_never_visited_rises_to_11_5():
     bonus, cells = table_novelty(CODE), np.eye(CODE, dtype=np.float32)
     bonus.optimizer = decespg_ex2.StackedOptimizer(bonus.discriminator.params, "sign", 0.1)
     bonus.remember(cells[[1] * 40][:, None, None], np.array([40]))
-    values, cross_entropy, _ = bonus.bonus(cells[[0] * 2000][:, None, None], np.array([2000]))
+    values, cross_entropy, _ = bonus.bonus(cells[[0]][:, None, None], np.array([1]), 250)
     assert values == pytest.approx(HIGHEST, abs=1e-5)
     assert cross_entropy < 0.05
 
@@ -289,7 +287,7 @@ def test_the_bonus_lies_between_0_and_11_5(monkeypatch):
     with torch.no_grad():
         bonus.discriminator.params[0][0] += torch.diag(torch.tensor([-3.0, 2.0, 40.0]))
     bonus.visits[:] = 1
-    values, _, overvisited = bonus.bonus(np.eye(3, dtype=np.float32)[:, None, None], np.array([3]))
+    values, _, overvisited = bonus.bonus(np.eye(3, dtype=np.float32)[:, None, None], np.array([3]), 1)
     assert values[:, 0, 0] == pytest.approx([0, 2, 11.512915], abs=1e-5)
     assert overvisited == pytest.approx([1 / 3])
 
@@ -299,7 +297,7 @@ def test_the_rarer_a_pair_is_the_higher_is_its_bonus():
     rng, p, bonus = np.random.default_rng(0), [0.5, 0.3, 0.15, 0.05], novelty(dim=5, min_replay=100)
 
     def judge(cells):
-        values = bonus.bonus(np.eye(5, dtype=np.float32)[cells][:, None, None], np.array([800]))[0][:, 0, 0]
+        values = bonus.bonus(np.eye(5, dtype=np.float32)[cells][:, None, None], np.array([800]), 100)[0][:, 0, 0]
         return np.array([values[cells == cell].mean() for cell in np.unique(cells)])
 
     for _ in range(13):
@@ -342,16 +340,30 @@ def test_there_is_no_bonus_before_min_replay_earlier_pairs():
     weights = [param.detach().clone() for param in bonus.discriminator.params]
     played = [((10, 9, 1), (0, 0, 0)), ((10, 10, 2), (0, 0, 0)), ((10, 2, 30), (1, 0, 0)), ((5, 5, 5), (1, 1, 1))]
     for lengths, fitted in played:
-        before = bonus.optimizer.count.flatten()[::2].tolist()
-        values, cross_entropy, _ = bonus.bonus(rng.random((30, 3, 2, 4), np.float32), np.array(lengths))
+        before = bonus.optimizer.count.copy()
+        values, cross_entropy, _ = bonus.bonus(rng.random((30, 3, 2, 4), np.float32), np.array(lengths), 3)
+        assert (bonus.optimizer.count - before).tolist() == [3 * now for now in fitted for _ in range(2)]
         for k in range(3):
             assert values[:, k].any() <= bool(fitted[k])
-            assert bonus.optimizer.count[2 * k] - before[k] == fitted[k] * max(lengths[k] // 8, 1)
+            assert (cross_entropy[k] == np.log(2)) == (not fitted[k])
             if not fitted[k]:
-                assert cross_entropy[k] == np.log(2)
-        untouched = [k for k in range(3) if bonus.optimizer.count[2 * k] == 0]
-        for net in (2 * k + i for k in untouched for i in range(2)):
-            assert all(torch.equal(a[net], b[net]) for a, b in zip(weights, bonus.discriminator.params, strict=True))
+                nets = slice(2 * k, 2 * k + 2)
+                for old, new in zip(weights, bonus.discriminator.params, strict=True):
+                    assert torch.equal(old[nets], new[nets])
+
+
+def test_between_fits_the_discriminators_rest_and_go_on_to_judge():
+    bonus, rng = novelty(trials=2, windows=2, min_replay=5), np.random.default_rng(0)
+    episode, lengths = rng.random((9, 2, 2, 4), np.float32), np.array([9, 7])
+    for _ in range(3):
+        expected, cross_entropy, _ = map(np.copy, bonus.bonus(episode, lengths, 2))
+    states = [generator.bit_generator.state for generator in bonus.learn]
+    found, entropy_then, _ = bonus.bonus(episode, lengths, 0)
+    assert np.array_equal(found, expected)
+    assert np.array_equal(entropy_then, cross_entropy)
+    assert states == [generator.bit_generator.state for generator in bonus.learn]
+    assert bonus.optimizer.count.tolist() == [4] * 4  # the first episode came before min_replay
+    assert bonus.visits.tolist() == [36, 28]
 
 
 @pytest.mark.parametrize("changed", [0, 1, 2, 3])
@@ -363,7 +375,7 @@ def test_windows_and_trials_are_private(changed):
         episode, lengths = rng.random((12, 2, 2, 4), np.float32), np.array([12, 9])
         elsewhere = episode.copy()
         elsewhere[:, k, i] = rng.random((12, 4))
-        found, expected = other.bonus(elsewhere, lengths)[0], one.bonus(episode, lengths)[0]
+        found, expected = other.bonus(elsewhere, lengths, 2)[0], one.bonus(episode, lengths, 2)[0]
         same = np.ones((2, 2), bool)
         same[k, i] = False
         assert np.array_equal(found[:, same], expected[:, same])

@@ -2,6 +2,7 @@
 
 import os
 import signal
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -111,7 +112,7 @@ def test_where_places_and_moves_are_the_embeddings_only_hindered_steps_earn_a_bo
     set_linear(model.psi, np.kron(np.eye(2), moves))
     set_linear(model.error, np.zeros((18, 4)))
     pairs = np.concatenate([np.eye(5, dtype=np.float32)[actions], obs[:60]], axis=3).reshape(60, 3, 1, 18)
-    bonus, _, _ = model.bonus(pairs, lengths, obs[1:].reshape(60, 3, 1, 8))
+    bonus, _, _ = model.bonus(pairs, lengths, obs[1:].reshape(60, 3, 1, 8), True)
     assert bonus.shape == (60, 3, 1)
     assert np.allclose(bonus[:, :, 0], expected, atol=1e-4)
     assert not bonus[17:, 2].any()
@@ -157,7 +158,7 @@ def plain_loss(own, steps, num_actions, args):
         gaussian = (eigenvalues.sum() + mean @ mean - dim - eigenvalues.log().sum()) / 2
     loss = residual + args["error_weight"] * penalty + args["information_weight"] * sum(information)
     figures = residual / (psi.square().sum() / size), 2 * np.log(2) - sum(information) / 2
-    return loss + args["gaussian_weight"] * gaussian, [float(figure) for figure in figures]
+    return loss + args["gaussian_weight"] * gaussian, [float(figure.detach()) for figure in figures]
 
 
 def plain_logits_of(own, parts):
@@ -249,6 +250,21 @@ def test_every_update_of_the_model_and_the_actors(world, tmp_path, monkeypatch):
     assert overflowed if world != "pushbox" else waited
 
 
+def test_later_the_model_learns_after_every_fifth_episode_only(tmp_path, monkeypatch):
+    assert [espg_emi.learns_after(episode) for episode in range(2000)] == [True] * 1000 + [True, *[False] * 4] * 200
+    monkeypatch.setattr(espg_emi, "learns_after", lambda episode: episode < 3 or episode == 6)
+    updates = record_updates(espg_emi, monkeypatch)
+    args = dict(env="pushbox", num_trials=1, num_episodes=9, max_steps=20, log_every=1)
+    model = train(espg_emi, tmp_path, **args, embedding_batch=2).novelty
+    assert len(updates) == 4 * 3 + 5  # the embeddings, the statistics and the actors, or the actors alone
+    assert model.optimizers[0].count.tolist() == [4]
+    shown = curves(tmp_path / "seed1")
+    for tag in ("unexplained", "information"):
+        values = [value for _, value in shown[f"charts/{tag}"]]
+        assert [after == before for before, after in pairwise(values)] == [False, False, True, True, True, False, True, True]
+    assert len({value for _, value in shown["charts/bonus"]}) == 9
+
+
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_model_has_an_adam_of_its_own(optimizer, tmp_path, monkeypatch):
     updates = record_updates(espg_emi, monkeypatch)
@@ -322,8 +338,8 @@ def test_the_model_learns_where_moves_lead_and_stays_surprised_at_walls(tmp_path
     """Under random play in findtreasure the steps in which both stand still and want to move keep the larger bonus."""
     seen, bonus_of = [], espg_emi.EmbeddingNovelty.bonus
 
-    def watched_bonus(self, pairs, lengths, next_obs):
-        found = bonus_of(self, pairs, lengths, next_obs)
+    def watched_bonus(self, pairs, lengths, next_obs, learn):
+        found = bonus_of(self, pairs, lengths, next_obs, learn)
         moved = (pairs[:, :, 0, 5:9] != next_obs[:, :, 0, :4]).any(2)
         acting = (pairs[:, :, 0, 4] == 0) & (pairs[:, :, 0, 13] == 0)
         during = np.arange(len(pairs))[:, None] < lengths
