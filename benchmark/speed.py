@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 from unittest.mock import patch
@@ -28,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 
 EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
+EXCHANGES = ("decespg_ex2", "espg_icm", "espg_emi", "gasil")  # DecESPG or ESPG with another component
 
 
 def print_table(title, head, rows):
@@ -53,17 +55,30 @@ def world_speed(name, num_envs, seconds=1.0):
     return steps / (time.process_time() - start)
 
 
-def script_speed(method, env, num_trials, num_episodes):
+def script_speed(method, env, num_trials, num_episodes, **changed):
     """Seconds of a training run and its useful steps (of trials whose episode still runs) per second."""
     script = importlib.import_module(f"algos.{method}")
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up")
+        args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up", **changed)
         script.train(args)
         args = dataclasses.replace(args, num_episodes=num_episodes, run_dir=Path(folder) / "run")
         start = time.process_time()
         steps = script.train(args).log.lengths.sum()
         seconds = time.process_time() - start
     return seconds, steps / seconds
+
+
+def component_speed(method, env, num_episodes):
+    """Seconds of DecESPG and of a script with another component, 20 trials, for the same episodes.
+
+    Both play the same if neither the bonus nor self-imitation counts in the reward; what they compute stays what it is.
+    """
+    silent = dict(beta=0.0, learning_rate=1e-3)
+    own, base = (dict(lambda_im=0.0), dict(slots=0)) if method == "gasil" else (dict(slots=10), dict(slots=10))
+    seconds, rate = script_speed("decespg", env, 20, num_episodes, **silent, **base)
+    own_seconds, own_rate = script_speed(method, env, 20, num_episodes, **silent, **own)
+    assert round(seconds * rate) == round(own_seconds * own_rate), "the episodes differ"
+    return seconds, own_seconds
 
 
 def bonus_speed(window, visits=20_000):
@@ -166,6 +181,13 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
             rows[-1] += [f"{many_rate / one_rate:.1f}", f"{many / seconds['pg', env]:.2f}"]
     head = ["script", "world", "episodes", "1 trial: s", "steps/s", "20 trials: s", "steps/s", "20 : 1 trials", "time : pg"]
     print_table("Training, useful environment steps per second:", head, rows)
+
+    rows = []
+    for method, env in product(filter(EXCHANGES.__contains__, methods), EPISODES):
+        base, own = component_speed(method, env, EPISODES[env] // (10 if quick else 1))
+        rows.append([method, env, f"{base:.0f}", f"{own:.0f}", f"{own / base:.2f}"])
+    head = ["script", "world", "decespg: s", "script: s", "script : decespg"]
+    print_table("Components for the same episodes, 20 trials:", head, rows)
 
     visit = {m: bonus_speed(m) for m in (50, 100, 200)}
     print_table("The exploration bonus:", ["window m", "microseconds per visit"], [[m, f"{visit[m]:.1f}"] for m in visit])
