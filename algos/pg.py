@@ -47,13 +47,13 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/pg.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-3),
-    ("cleaner", "adam"): dict(learning_rate=1e-3),
+    ("cleaner", "adam"): dict(learning_rate=3e-4),
     ("findtreasure", "sign"): dict(learning_rate=1e-3),
     ("findtreasure", "adam"): dict(learning_rate=1e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3),
     ("gotogether", "adam"): dict(learning_rate=1e-3),
     ("movebox", "sign"): dict(learning_rate=1e-3),
-    ("movebox", "adam"): dict(learning_rate=1e-3),
+    ("movebox", "adam"): dict(learning_rate=3e-4),
     ("pushbox", "sign"): dict(learning_rate=3e-4),
     ("pushbox", "adam"): dict(learning_rate=1e-3),
 }
