@@ -16,8 +16,8 @@ for continuous actions rewards diversity instead). What has to be chosen here:
   per agent, as its place has (there 2 for one agent).
 - There, 3 epochs of minibatches of 512 follow every 100 000 steps of play. Here an episode may have 3 steps, of which a
   covariance is singular and no marginal can be had. So minibatches of 64 are drawn from the last 4000 steps, the first when 64
-  have been seen: one after each of the first 1000 episodes, which in findtreasure and pushbox last 19 and 27 steps, and one
-  after every fifth of the others, of 9 and 5 steps. So every step of play is used 1.4 to 3.4 times.
+  have been seen: one after each of the first 1000 episodes, which in findtreasure and pushbox last 19 and 27 steps (under sign
+  descent), and one after every fifth of the others, of 9 and 5 steps. So every step of play is used 1.4 to 3.4 times.
 - These are fewer steps of Adam, so they are 0.003 long (there 0.001): under random play in findtreasure ||e||^2 comes to rest
   after 250 of them instead of 700, at the same value.
 - w_S leaves S about 1 % of what phi and psi cannot say, so steps into a wall or a teammate go on to earn a bonus.

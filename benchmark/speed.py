@@ -56,7 +56,7 @@ def world_speed(name, num_envs, seconds=1.0):
 
 
 def script_speed(method, env, num_trials, num_episodes, **changed):
-    """Seconds of a training run and its useful steps (of trials whose episode still runs) per second."""
+    """Seconds of a training run and its useful steps (of trials whose episode still runs) per second; `changed` arguments."""
     script = importlib.import_module(f"algos.{method}")
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
         args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up", **changed)
@@ -182,7 +182,7 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
     print_table("Training, useful environment steps per second:", head, rows)
 
     rows = []
-    for method, env in product(filter(NOVELTIES.__contains__, methods), EPISODES):
+    for method, env in product([each for each in methods if each in NOVELTIES], EPISODES):
         base, own = novelty_speed(method, env, EPISODES[env] // (10 if quick else 1))
         rows.append([method, env, f"{base:.0f}", f"{own:.0f}", f"{own / base:.2f}"])
     head = ["script", "world", "decespg: s", "script: s", "script : decespg"]
