@@ -19,7 +19,7 @@ import envs
 @dataclass
 class Args:
     world: tyro.conf.Positional[str]
-    """cleaner, findtreasure, gotogether, movebox or pushbox"""
+    """cleaner, findtreasure, gotogether, movebox or pushbox, or a file with a world of your own such as my_world.py"""
     options: tyro.conf.Positional[tuple[str, ...]] = ()
     """options of the world, such as size=6 (envs/<world>.py lists them)"""
     keys: bool = False

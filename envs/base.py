@@ -4,14 +4,48 @@ A world is a small state (a row of integers), a compiled function `step` that ch
 function `observe` that says what each agent sees of it. Everything else (vector face, search, drawing) is built on these two.
 """
 
-from functools import cache
+import atexit
+import shutil
+import sys
+import tempfile
+from functools import cache, cached_property
 
+import numba
 import numpy as np
-from numba import njit
+from numba import float32, float64, int64, njit, typeof
+from numba.core.types import CompileResultWAP
+
+
+def find_cache():
+    """Let numba do without its cache on disk, and say so once, where none can be written: a read-only disk and no home."""
+    try:
+        njit(cache=True)(find_cache)  # compiles nothing yet, but looks for a place
+    except RuntimeError:
+        numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="envs-")
+        atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
+        print(
+            "Compiled code cannot be kept here, so every start compiles anew; NUMBA_CACHE_DIR names a place.", file=sys.stderr
+        )
+
+
+find_cache()
 
 # How the functions of a world are compiled: as by `njit(cache=True)`, but without numba's counting of references to arrays,
 # which would take a third to half of the time of a step. So they cannot make arrays, only read and write those they are given.
 rule = njit(cache=True, _nrt=False)
+# The same for the loops around them, in which a division by zero gives what it gives in numpy.
+kernel = njit(cache=True, _nrt=False, error_model="numpy")
+
+
+@cache
+def by_address(function, *types):
+    """A compiled function, for arguments of these numba types, as an argument of another one.
+
+    The other one knows its address only, so it can be cached on disk, one for all worlds. If it called the rules by name, numba
+    would cache them with it, and an edited world would silently keep its old rules.
+    """
+    function.compile(types)
+    return CompileResultWAP(function.overloads[types])
 
 
 class UsageError(ValueError):
@@ -27,13 +61,17 @@ class World:
     Both are compiled by `rule` and take `rules` as the world built it: an array or a record of the world's numbers.
     """
 
-    name: str
+    name: str  # the class's in small letters unless it says another
     action_names: tuple[str, ...]
-    outcome_names: tuple[str, ...]  # the names of outcomes 1, 2, ...
+    outcome_names: tuple[str, ...] = ()  # the names of outcomes 1, 2, ...
     sights: tuple[str, ...] = ()  # what the entries of a one-hot observation stand for; none where positions are observed
-    best_outcome: int  # the outcome a good team ends in; 0 if the world has none
+    best_outcome: int = 0  # the outcome a good team ends in; 0 if the world has none
+    largest_reward: float = 1.0  # of one step; methods whose numbers are relative to the scale of rewards ask for it (EDTI)
     searchable = True  # small enough for `envs.optimum` to visit every state; otherwise the world has a `plan`
     step = observe = None  # compiled functions, set by the subclass as staticmethod
+
+    def __init_subclass__(cls):
+        cls.name = cls.__dict__.get("name", cls.__name__.lower())
 
     def __init__(self, rules, start, local_index, num_agents, obs_dim, cell, state_scale, max_steps):
         """Arguments:
@@ -49,20 +87,29 @@ class World:
         self.max_steps = check_whole("max_steps", max_steps, minimum=1)
         self.rules, self.start = rules, np.array(start, np.int64)
         self.local_index = np.array(local_index, np.int64)
-        self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, cell
+        self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, float(cell)
         self.state_scale = np.array(state_scale, np.float32)
 
     @property
     def num_actions(self) -> int:
         return len(self.action_names)
 
+    @cached_property
+    def compiled(self):
+        """`step` and `observe` as compiled loops take them, see `by_address`."""
+        for function in (self.step, self.observe):
+            if not hasattr(function, "compile"):
+                raise UsageError(f"{self.name}'s step and observe must be functions compiled by envs.rule.")
+        rules, state = typeof(self.rules), int64[::1]
+        return by_address(self.step, rules, state, state), by_address(self.observe, rules, float64, state, float32[:, ::1])
+
     def plan(self):
         """Joint actions [max_steps, num_agents] of a good team, in a world that is not searchable and never ends early."""
         raise NotImplementedError
 
     def sketch(self, state):
-        """The picture of `state` as `(height, width, shapes)`, see `envs.drawing`."""
-        raise NotImplementedError
+        """The picture of `state` as `(rows, columns, shapes)`, see `envs.drawing`."""
+        raise UsageError(f"{self.name} cannot be drawn, because its class has no method `sketch`.")
 
 
 def check_whole(option, value, minimum):
@@ -127,6 +174,10 @@ class PositionWorld(World):
             state_scale=[1 / size] * positions + [1] * (len(start) - positions),
             max_steps=max_steps,
         )
+
+    def sketch(self, state):
+        """The agents in an empty room; worlds with more to show add it."""
+        return self.size, self.size, self.sketch_agents(state)
 
     def sketch_agents(self, state):
         """The shapes of the agents, see `envs.drawing`."""

@@ -66,6 +66,7 @@ class Cleaner(PositionWorld):
     action_names = ("up", "down", "left", "right")
     outcome_names = ()
     best_outcome = 0
+    largest_reward = 1.0
     searchable = False
     step = staticmethod(step)
 

@@ -1,8 +1,8 @@
 """Pictures of the worlds in the style of a paper's figure, GIFs of episodes, and maps in letters for the terminal.
 
 A world says what it looks like by `world.sketch(state) -> (rows, columns, shapes)`; row 0 is the top. The shapes are
-    ("cell", kind, row, column)            a cell in the colour of `kind`, one of CELLS
-    ("box", kind, row, column, width)      a box from `column` on, `width` cells wide; `kind` is one of BOXES
+    ("cell", kind, row, column)            a cell in the colour of `kind`, of CELLS or any other word
+    ("box", kind, row, column, width)      a box from `column` on, `width` cells wide; `kind` as in BOXES or any other word
     ("agent", index, row, column, facing)  agent number `index`; facing 0 north, 1 east, 2 south, 3 west, or None
 drawn in this order: cells, the grid's lines, boxes, agents. Agents that share a cell stand smaller in a ring.
 """
@@ -30,6 +30,7 @@ CELLS = {
     "dirt": "#a8d9b0",
 }
 BOXES = {"small box": "#e6c79b", "large box": "#c08f5a", "box": "#c08f5a"}
+OTHERS = ("#c9b6e4", "#9fd8df", "#f2b8a0", "#c5d86d", "#e3a6c4")  # for kinds in a world of the user's own
 LETTERS = {
     **{"wall": "#", "door": "D", "open door": "o", "lever": "L", "meeting": "m", "treasure": "T", "goal": "g"},
     **{"near goal": "n", "far goal": "f", "dirt": ".", "small box": "s", "large box": "B", "box": "B"},
@@ -37,6 +38,11 @@ LETTERS = {
 # Red and blue first; the shades differ in lightness too, so that they can be told apart without red or green.
 AGENTS = ("#d62f2f", "#1f5fa8", "#f59a3c", "#7a3fa0", "#35b6cf", "#e58bc4", "#7d7d7d", "#5e3413")
 FINE = 4  # everything is drawn this many times larger and averaged, which smooths the edges and keeps even areas even
+
+
+def colour_of(kind, colours):
+    """The colour of a kind of cell or box; one that is not listed has the same of OTHERS wherever it is drawn."""
+    return colours.get(kind) or OTHERS[sum(kind.encode()) % len(OTHERS)]
 
 
 def draw(world, state, cell=48, caption=""):
@@ -64,7 +70,7 @@ def draw(world, state, cell=48, caption=""):
                 pen.rectangle((left, top, left + line - 1, top + unit - 1), GRID)
     pen.rectangle((0, 0, large.width - 1, large.height - 1), outline=INK, width=line)
     for kind, row, column, cells in shapes_of["box"]:
-        _draw_box(pen, BOXES[kind], row * unit, column * unit, cells, unit)
+        _draw_box(pen, colour_of(kind, BOXES), row * unit, column * unit, cells, unit)
     for row, column in dict.fromkeys(shape[1:3] for shape in shapes_of["agent"]):
         here = [(index, facing) for index, r, c, facing in shapes_of["agent"] if (r, c) == (row, column)]
         if len(here) == 1:
@@ -92,7 +98,7 @@ def draw(world, state, cell=48, caption=""):
 
 def _draw_cell(large, kind, top, left, unit):
     """One cell in its colour; an open door is hatched."""
-    tile = Image.new("RGB", (unit, unit), CELLS[kind])
+    tile = Image.new("RGB", (unit, unit), colour_of(kind, CELLS))
     if kind == "open door":
         pen = ImageDraw.Draw(tile)
         for x in range(-unit, unit, unit // 4):
@@ -149,8 +155,8 @@ def text_map(world, state):
             agents[row, column] = f"{agents.get((row, column), '')}{index}{'' if facing is None else '^>v<'[facing]}"
         else:
             kind, row, column, cells = (*shape, 1)[:4]
-            kinds[kind] = LETTERS[kind]
-            letters.update({(row, column + k): LETTERS[kind] for k in range(cells)})
+            kinds[kind] = LETTERS.get(kind, kind[0])
+            letters.update({(row, column + k): kinds[kind] for k in range(cells)})
     width = max(2, *map(len, agents.values()))
     lines = [
         "".join((agents.get((r, c), "") + letters.get((r, c), " ") * width)[:width] for c in range(columns))

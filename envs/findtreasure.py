@@ -64,6 +64,7 @@ class FindTreasure(PositionWorld):
     action_names = ("up", "down", "left", "right", "wait")
     outcome_names = ("treasure", "meeting")
     best_outcome = 1
+    largest_reward = TREASURE_REWARD
     step = staticmethod(step)
 
     def __init__(self, size: int = 7, observation: str = "positions", max_steps: int = 200):

@@ -54,6 +54,7 @@ class GoTogether(PositionWorld):
     action_names = ("up", "down", "left", "right")
     outcome_names = ("goal",)
     best_outcome = 1
+    largest_reward = GOAL_REWARD
     step = staticmethod(step)
 
     def __init__(self, size: int = 15, observation: str = "positions", max_steps: int = 2000):

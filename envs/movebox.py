@@ -98,6 +98,7 @@ class MoveBox(PositionWorld):
     action_names = ("up", "down", "left", "right")
     outcome_names = ("far goal", "near goal")
     best_outcome = 1
+    largest_reward = FAR_REWARD
     step = staticmethod(step)
 
     def __init__(self, observation: str = "positions", max_steps: int = 200):

@@ -133,6 +133,7 @@ class PushBox(World):
     sights = ("small box", "large box", "empty", "boundary", "teammate")  # as numbered above
     outcome_names = ("small left", "small right", "both small", "large")
     best_outcome = 4
+    largest_reward = LARGE_REWARD
     step, observe = staticmethod(step), staticmethod(observe)
 
     def __init__(

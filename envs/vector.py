@@ -63,6 +63,7 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         actions = np.asarray(actions)
         if actions.shape != self._actions_shape or actions.dtype.kind not in "iu":
             raise ValueError(f"actions must be whole numbers of shape {self._actions_shape}.")
+        actions = np.ascontiguousarray(actions, np.int64)  # the rules are compiled for one type of whole numbers
         reward, terminated, truncated, outcome, obs, state, local_state = next(self._spare, None) or self._make_spare()
         if not self._advance(actions, reward, terminated, truncated, outcome, obs, state, local_state):
             raise ValueError(f"actions must be between 0 and {self.world.num_actions - 1}.")
@@ -82,6 +83,11 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         ]
         self._spare = zip(*[np.empty((steps, self.num_envs, *shape), dtype) for shape, dtype in kinds], strict=True)
         return next(self._spare)
+
+    @property
+    def states(self):
+        """The state of every copy in whole numbers, [num_envs, state_dim]; a copy."""
+        return self._memory[:, 2:].copy()
 
     def render(self):
         """A tuple with one RGB picture [height, width, 3] (uint8) of every copy."""

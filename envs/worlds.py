@@ -1,0 +1,74 @@
+"""The worlds by name, and a user's own world from a file."""
+
+import ast
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+
+from envs.base import UsageError, World
+from envs.cleaner import Cleaner
+from envs.findtreasure import FindTreasure
+from envs.gotogether import GoTogether
+from envs.movebox import MoveBox
+from envs.pushbox import PushBox
+
+WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox)}
+
+
+def make_world(name: str, **options) -> World:
+    """The world `name`, or the one in the file `name` (such as "my_world.py"), with its options.
+
+    UsageError for an unknown world or option, an impossible value, or a file that holds no world.
+    """
+    name = str(name)
+    if name in WORLDS:
+        world = WORLDS[name]
+    elif name.endswith(".py"):
+        world = world_in_file(Path(name))
+    else:
+        raise UsageError(f"there is no world {name!r}; the worlds are {', '.join(WORLDS)}, or a file such as my_world.py.")
+    accepted = list(inspect.signature(world).parameters)
+    for option in options:
+        if option not in accepted:
+            takes = f"takes {', '.join(accepted)}" if accepted else "has none"
+            raise UsageError(f"{name} has no option {option!r}; it {takes}.")
+    return world(**options)
+
+
+def world_in_file(path):
+    """The one subclass of World that a Python file defines."""
+    if not path.is_file():
+        raise UsageError(f"there is no file {path}.")
+    name = f"world_{path.stem}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)  # numba looks for a module of this name
+    try:
+        spec.loader.exec_module(module)
+    except UsageError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise UsageError(f"{path} cannot be imported: {type(error).__name__}: {reason}.") from error
+    found = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, World) and value.__module__ == name
+    ]
+    if len(found) != 1:
+        raise UsageError(f"{path} must define one subclass of envs.World, not {len(found)}.")
+    return found[0]
+
+
+def parse_options(words) -> dict:
+    """Options from the command line: ["size=9", "observation=own"] -> {"size": 9, "observation": "own"}."""
+    options = {}
+    for word in words:
+        option, equals, value = word.partition("=")
+        if not (option and equals and value):
+            raise UsageError(f"a world's option is written option=value, not {word!r}.")
+        try:
+            options[option] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            options[option] = value
+    return options
