@@ -16,31 +16,21 @@ explore by themselves (no floor under their probabilities) are chosen here.
     python algos/coma.py --env findtreasure --num-trials 20
 """
 
-import contextlib
-import json
-import signal
-import subprocess
 import sys
-import time
-from copy import copy
-from dataclasses import asdict, dataclass, fields
-from importlib.metadata import version
+from copy import deepcopy
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-import tyro
 from numba import njit
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import envs
-
-sys.modules.setdefault(Path(__file__).stem, sys.modules[__name__])  # where numba's cache looks after an import by this name
+from envs import Rollout, distinct_rows, in_every_step
+from envs.run import AtLeast, Between, Run, RunArgs, generators_of, main, resolve
 
 # Table 1 of the paper.
 WORLDS = {
@@ -63,60 +53,25 @@ TUNED = {
     ("pushbox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
-# The lowest and highest value of every number that makes sense.
-LIMITS = dict(
-    **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
-    **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
-    **dict(critic_learning_rate=(0, np.inf), td_lambda=(0, 1), target_critic_every=(1, np.inf)),
-)
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critics learn from rewards divided by this, so from 0.3 to 10; their curves are in units of reward
 
 
 @dataclass
-class Args:
-    env: str = "pushbox"
-    """world: cleaner, findtreasure, gotogether, movebox or pushbox"""
-    env_args: tuple[str, ...] = ()
-    """options of the world, such as size=6 (envs/<world>.py lists them)"""
-    seed: int = 1
-    """seed of the first trial; trial k has seed + k"""
-    num_trials: int = 1
-    """independent trials, trained side by side in this process"""
-    num_episodes: int | None = None
-    """training episodes of each trial (None: Table 1); with --evaluate, episodes to play (None: 100)"""
-    max_steps: int | None = None
-    """time limit of an episode in steps (None: Table 1)"""
-    hidden: tuple[int, ...] | None = None
-    """widths of the hidden layers (None: Table 1)"""
-    gamma: float | None = None
-    """discount factor (None: Table 1)"""
+class Args(RunArgs):
+    hidden: Annotated[tuple[int, ...] | None, AtLeast(1)] = None
+    """widths of the hidden layers (None: Table 1; 64 in other worlds)"""
+    gamma: Annotated[float | None, Between(0, 1)] = None
+    """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
-    learning_rate: float | None = None
-    """step size of the policies (None: tuned for world and optimiser)"""
-    log_every: int = 100
-    """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
-    run_dir: Path | None = None
-    """where the run's files go (None: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
-    checkpoint_every: float = 60.0
-    """seconds between two checkpoints (longer where writing one would take over 2 % of the time)"""
-    resume: bool = False
-    """go on from the checkpoint in the run's directory"""
-    overwrite: bool = False
-    """start anew even if the run's directory holds results"""
-    save_model: bool = False
-    """write the trained policies to policy.pt"""
-    capture_video: bool = False
-    """write one episode of the first trial's trained team to team.gif"""
-    evaluate: Path | None = None
-    """do not train: play the teams of this policy.pt, print how their episodes end and write a GIF beside it"""
-    greedy: bool = False
-    """with --evaluate: take the likeliest actions instead of drawing from the policies"""
-    critic_learning_rate: float | None = None
-    """step size of the critic, which always has a persistent Adam (None: tuned for world and optimiser)"""
-    td_lambda: float = 0.8
+    learning_rate: Annotated[float | None, AtLeast(0)] = None
+    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
+    """step size of the critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in others)"""
+    td_lambda: Annotated[float, Between(0, 1)] = 0.8
     """lambda of the critics' targets: 0 looks one step ahead, 1 to the end of the episode (Foerster et al.)"""
-    target_critic_every: int = 200
+    target_critic_every: Annotated[int, AtLeast(1)] = 200
     """episodes, each a step of the critics, between two copies of the critics to the target critics (EPyMARL)"""
 
 
@@ -133,184 +88,36 @@ class StackedMLP:
                 self.params.append(torch.from_numpy(draws).float().requires_grad_())
 
     def __call__(self, x):
-        """x [num_nets, batch, in] -> [num_nets, batch, out]."""
+        """x [num_nets, batch, in], a tensor or an array -> [num_nets, batch, out]."""
+        x = torch.as_tensor(x)
         for layer in range(0, len(self.params), 2):
             if layer > 0:
                 x = torch.relu(x)
             x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
         return x
 
-    def subset(self, nets):
-        """A copy of some of the networks."""
-        part = copy(self)
-        part.params = [param[nets] for param in self.params]
-        return part
 
+def update(optimizer, kind, loss):
+    """One step down the gradient of a loss summed over all trials, whose networks it moves independently of each other.
 
-Policy = StackedMLP  # what agents act with: observations to logits of the actions
-
-
-@njit(cache=True, error_model="numpy")  # which lets divisions be vectorised
-def sign_step(param, grad, active, learning_rate):
-    """One step of sign descent, in place; param and grad [num_nets, num_weights], the mask active [num_nets]."""
-    real = param.dtype.type  # single precision stays single
-    rate, tiny = real(learning_rate), real(1e-8)
-    for net in np.flatnonzero(active):
-        for j in range(param.shape[1]):
-            g = grad[net, j]
-            param[net, j] -= rate * g / (abs(g) + tiny)
-
-
-@njit(cache=True, error_model="numpy")
-def adam_step(param, grad, first, second, count, active, learning_rate):
-    """One step of Adam, in place; param, grad and both moments [num_nets, num_weights], count and active [num_nets]."""
-    real = param.dtype.type
-    rate, tiny, weight1, weight2 = real(learning_rate), real(1e-8), real(0.1), real(0.001)
-    for net in np.flatnonzero(active):
-        correction1, correction2 = real(1 - 0.9 ** count[net]), real(1 - 0.999 ** count[net])
-        for j in range(param.shape[1]):
-            g = grad[net, j]
-            first[net, j] += weight1 * (g - first[net, j])
-            second[net, j] += weight2 * (g * g - second[net, j])
-            param[net, j] -= rate * (first[net, j] / correction1) / (np.sqrt(second[net, j] / correction2) + tiny)
-
-
-class StackedOptimizer:
-    """Gradient descent for stacked networks, every network on its own.
-
-    "sign": w -= lr g / (|g| + 1e-8), which is exactly the first step of a fresh Adam (the authors create one in every update).
-    "adam": Adam (Kingma & Ba, 2015) with betas 0.9 and 0.999; moments and step count belong to the network.
+    "adam": a persistent Adam. "sign": a new Adam in every update, as in the authors' scripts. The first step of an Adam is
+    lr g / (|g| + 1e-8), so this is descent along the sign of the gradient.
     """
-
-    def __init__(self, params, kind, learning_rate):
-        self.params, self.learning_rate = params, learning_rate
-        self.count = np.zeros(len(params[0]), np.int64)
-        self.moments = [[np.zeros_like(p.detach().numpy()) for _ in range(2 if kind == "adam" else 0)] for p in params]
-        self.state = [self.count, *(moment for moments in self.moments for moment in moments)]
-
-    def step(self, grads, active=None):
-        """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        active = np.ones(len(self.count), bool) if active is None else active.numpy()
-        self.count += active
-        for param, grad, moments in zip(self.params, grads, self.moments, strict=True):
-            arrays = [array.reshape(len(active), -1) for array in (param.detach().numpy(), grad.numpy(), *moments)]
-            if moments:
-                adam_step(*arrays, self.count, active, self.learning_rate)
-            else:
-                sign_step(*arrays, active, self.learning_rate)
+    if kind == "sign":
+        optimizer.state.clear()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
 
 
-@njit(cache=True)
-def sample_actions(logits, uniforms):
-    """Draw from softmax(logits) by inverting the distribution function.
-
-    logits [num_trials, num_agents, num_actions], uniforms in [0, 1) [num_trials, num_agents] -> actions, shaped as uniforms.
-    """
-    actions = np.empty(uniforms.shape, np.int64)
-    for k in range(logits.shape[0]):
-        for i in range(logits.shape[1]):
-            highest = logits[k, i].max()
-            total = 0.0
-            for logit in logits[k, i]:
-                total += np.exp(np.float64(logit - highest))
-            a, remaining = -1, uniforms[k, i] * total
-            while remaining >= 0.0 and a < logits.shape[2] - 1:
-                a += 1
-                remaining -= np.exp(np.float64(logits[k, i, a] - highest))
-            actions[k, i] = a
-    return actions
-
-
-class Rollout:
-    """One episode of every trial, time first; a row beyond a trial's length counts for nothing.
-
-    Only `obs` has one row more, for what was seen after the last step (critics ask for it where the time limit cuts).
-    """
-
-    def __init__(self, env):
-        world, shape = env.world, (env.world.max_steps, env.num_envs)
-        self.obs = np.zeros((world.max_steps + 1, env.num_envs, world.num_agents, world.obs_dim), np.float32)
-        self.actions = np.zeros((*shape, world.num_agents), np.int64)
-        self.reward = np.zeros(shape)
-        self.lengths = np.zeros(env.num_envs, np.int64)
-        self.outcomes = np.zeros(env.num_envs, np.int64)
-
-
-@torch.no_grad()
-def collect(env, policy, uniforms, rollout, frames=None):
-    """Play one episode in every world, in lock step until the last has ended, and write it into `rollout`.
-
-    The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
-    Pictures of the first world are appended to `frames` if it is a list.
-    """
-    num_agents = env.world.num_agents
-    rollout.obs[0], _ = env.reset()
-    if frames is not None:
-        frames.append(env.draw(0, caption="start"))
-    rollout.lengths[:] = 0
-    running, playing, num_playing, actor = np.ones(env.num_envs, bool), slice(None), env.num_envs, policy
-    actions = np.zeros(rollout.actions.shape[1:], np.int64)
-    for t in range(env.world.max_steps):
-        logits = actor(torch.from_numpy(rollout.obs[t][playing]).view(num_playing * num_agents, 1, -1))
-        logits = logits.view(num_playing, num_agents, -1).numpy()
-        actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
-        rollout.actions[t] = actions
-        rollout.lengths += running
-        rollout.obs[t + 1], rollout.reward[t], terminated, truncated, info = env.step(actions)
-        if frames is not None and running[0]:
-            frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
-        running = ~(terminated | truncated)
-        num_running = np.count_nonzero(running)
-        if num_running == 0:
-            break
-        if 2 * num_running <= num_playing:  # acting takes as long as there are networks: let those that wait go
-            playing, num_playing = np.flatnonzero(running), num_running
-            actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
-    rollout.outcomes[:] = info["outcome"]
-
-
-@njit(cache=True)
-def distinct_observations(obs, lengths):
-    """What the networks have to see of an episode: every distinct observation, the one after the last step too, but only once.
-
-    obs [T + 1, num_trials, num_agents, obs_dim], lengths [num_trials] -> distinct observations [num_nets, U, obs_dim], 0 in the
-    rows that a network with fewer than U leaves over, and each step's row among them [T + 1, num_trials, num_agents].
-    """
-    _, trials, agents, dim = obs.shape
-    distinct = np.zeros((trials * agents, lengths.max() + 1, dim), np.float32)
-    rows = np.zeros((lengths.max() + 1, trials, agents), np.int64)
-    buckets = 2
-    while buckets < 2 * lengths.max() + 2:
-        buckets *= 2
-    bits = obs.view(np.int32)
-    most = 0
-    for k in range(trials):
-        for i in range(agents):
-            net, found = k * agents + i, 0
-            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
-            for t in range(lengths[k] + 1):
-                bucket = 0
-                for j in range(dim):
-                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
-                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
-                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
-                    bucket = (bucket + 1) & (buckets - 1)
-                if row_in[bucket] < 0:
-                    row_in[bucket] = found
-                    distinct[net, found] = obs[t, k, i]
-                    found += 1
-                rows[t, k, i] = row_in[bucket]
-            most = max(most, found)
-    return distinct[:, :most].copy(), rows
-
-
-def in_every_step(outputs, rows):
-    """What networks say step by step; outputs [num_nets, U, n], rows [T + 1, num_trials, num_agents] -> [.., n].
-
-    `rows` says where in the outputs a step is, as from `distinct_observations`.
-    """
-    nets = torch.arange(len(outputs)).view(rows.shape[1:])
-    return outputs[nets, torch.from_numpy(rows)]
+def next_actions(policy, rollout, generators):
+    """Actions that the teams draw after the last step and do not play, [num_trials, num_agents]; one generator a trial."""
+    last = rollout.all_obs[rollout.lengths, np.arange(len(rollout.lengths))]  # [num_trials, num_agents, obs_dim]
+    uniforms = np.array([generator.random(last.shape[1]) for generator in generators])
+    with torch.no_grad():
+        probs = torch.softmax(policy(last.reshape(-1, 1, last.shape[2])).double(), dim=-1)
+    bounds = probs.numpy().cumsum(2).reshape(*uniforms.shape, -1)  # the distribution function, which is inverted
+    return (uniforms[:, :, None] >= bounds[:, :, :-1]).sum(2)
 
 
 def critic_inputs(obs, actions, num_actions):
@@ -350,331 +157,59 @@ def lambda_targets(reward, values, lengths, terminated, gamma, td_lambda):
     return targets
 
 
-@njit(cache=True)
-def merge_steps(obs, actions, weights, lengths, num_actions):
-    """Add up the weights of equal steps: sum_t w_t log pi(a_t | o_t) needs every distinct observation only once.
-
-    obs [T, num_trials, num_agents, obs_dim], actions and weights [T, num_trials, num_agents], lengths [num_trials]
-    -> distinct observations [num_nets, U, obs_dim] and the weights of all actions there [num_nets, U, num_actions], 0 in the
-    rows that a network with fewer than U distinct observations leaves over. There is one network per trial and agent.
-    """
-    _, trials, agents, dim = obs.shape
-    distinct = np.zeros((trials * agents, lengths.max(), dim), np.float32)
-    weight = np.zeros((trials * agents, lengths.max(), num_actions))
-    buckets = 2
-    while buckets < 2 * lengths.max():
-        buckets *= 2
-    bits = obs.view(np.int32)
-    most = 0
-    for k in range(trials):
-        for i in range(agents):
-            net, found = k * agents + i, 0
-            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
-            for t in range(lengths[k]):
-                bucket = 0
-                for j in range(dim):
-                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
-                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
-                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
-                    bucket = (bucket + 1) & (buckets - 1)
-                if row_in[bucket] < 0:
-                    row_in[bucket] = found
-                    distinct[net, found] = obs[t, k, i]
-                    found += 1
-                weight[net, row_in[bucket], actions[t, k, i]] += weights[t, k, i]
-            most = max(most, found)
-    return distinct[:, :most].copy(), weight[:, :most].astype(np.float32)
+def build(args, world, init):
+    """All that learns or remembers, for all trials; `init` are the generators of the first weights."""
+    critic_dim = world.num_agents * world.obs_dim + (world.num_agents - 1) * world.num_actions
+    policy = StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])
+    critic = StackedMLP(init, world.num_agents, [critic_dim, *args.hidden, world.num_actions])
+    return SimpleNamespace(policy=policy, critic=critic, target_critic=deepcopy(critic))
 
 
 def train(args: Args):
-    """Train `num_trials` teams side by side; returns the policies, the critics and the log of all episodes."""
-    torch.set_num_threads(1)
-    args, env = resolve(args)
-    world, num_agents = env.world, env.world.num_agents
-    seeds = [np.random.SeedSequence(args.seed + k).spawn(3) for k in range(args.num_trials)]
-    init, act, learn = [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
-
-    policy = Policy(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
-    critic_dim = num_agents * world.obs_dim + (num_agents - 1) * world.num_actions
-    critic = StackedMLP(init, num_agents, [critic_dim, *args.hidden, world.num_actions])
-    target_critic = copy(critic)
-    target_critic.params = [param.detach().clone() for param in critic.params]
-    optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
-    critic_optimizer = StackedOptimizer(critic.params, "adam", args.critic_learning_rate)
-    rollout = Rollout(env)
-    uniforms = np.empty((args.num_trials, world.max_steps, num_agents))
-    next_uniforms, trials = np.empty((args.num_trials, num_agents)), np.arange(args.num_trials)
-    arrays = [*policy.params, *optimizer.state, *critic.params, *target_critic.params, *critic_optimizer.state]
-    run = Run(args, env, arrays, generators=[*act, *learn], figures=("value", "td_error"))
+    """Train `num_trials` teams side by side; returns the policies, the method's parts and the log of all episodes."""
+    args, world = resolve(args, WORLDS, TUNED, OTHER)
+    init, act, learn = generators_of(args)
+    team = build(args, world, init)
+    optimizer = torch.optim.Adam(team.policy.params, lr=args.learning_rate, fused=True)
+    critic_optimizer = torch.optim.Adam(team.critic.params, lr=args.critic_learning_rate, fused=True)
+    rollout, trials = Rollout(world, args.num_trials), np.arange(args.num_trials)
+    run = Run(args, world, team, optimizers=[optimizer, critic_optimizer], generators=[*act, *learn])
 
     for episode in run.episodes():
-        # Play one episode of every trial.
-        for generator, row in zip(act, uniforms, strict=True):
-            generator.random(out=row)
-        collect(env, policy, uniforms, rollout)
-        lengths, longest = rollout.lengths, rollout.lengths.max()
-        reward = rollout.reward[:longest] / REWARD_SCALE  # [T, num_trials]
-        share = (np.arange(longest)[:, None, None] < lengths[:, None]) / lengths[:, None]  # 1/T in an episode, 0 beyond its end
-
-        # What the policies say in every step, and after the last one, where the team draws actions that it does not play.
-        with torch.no_grad():
-            obs, rows = distinct_observations(rollout.obs, lengths)
-            logits = in_every_step(policy(torch.from_numpy(obs)), rows)  # [T + 1, num_trials, num_agents, num_actions]
-        for generator, row in zip(learn, next_uniforms, strict=True):
-            generator.random(out=row)
-        actions = np.concatenate([rollout.actions[:longest], rollout.actions[:1]])  # [T + 1, num_trials, num_agents]
-        actions[lengths, trials] = sample_actions(logits.numpy()[lengths, trials], next_uniforms)
+        rollout.play(team.policy.params, act)
+        reward = rollout.reward[:, :, 0] / REWARD_SCALE  # [T, num_trials]
+        share = torch.from_numpy(rollout.played / rollout.lengths)[:, :, None]  # 1/T in an episode, 0 beyond its end
 
         # The critics' values, before they learn from this episode, and their targets.
-        inputs, rows = distinct_observations(critic_inputs(rollout.obs[: longest + 1], actions, world.num_actions), lengths)
-        inputs = torch.from_numpy(inputs)
-        values = in_every_step(critic(inputs), rows)[:-1]  # [T, num_trials, num_agents, num_actions]
+        actions = np.concatenate([rollout.actions, rollout.actions[:1]])  # [T + 1, num_trials, num_agents]
+        actions[rollout.lengths, trials] = next_actions(team.policy, rollout, learn)
+        inputs, rows = distinct_rows(critic_inputs(rollout.all_obs, actions, world.num_actions), rollout.lengths + 1)
+        values = in_every_step(team.critic(inputs), rows)[:-1]  # [T, num_trials, num_agents, num_actions]
         with torch.no_grad():
-            target_values = in_every_step(target_critic(inputs), rows)
-        target_values = np.take_along_axis(target_values.double().numpy(), actions[..., None], axis=3)[..., 0]
-        targets = lambda_targets(reward, target_values, lengths, rollout.outcomes > 0, args.gamma, args.td_lambda)
+            target_values = in_every_step(team.target_critic(inputs), rows).double().numpy()
+        target_values = np.take_along_axis(target_values, actions[..., None], axis=3)[..., 0]  # [T + 1, num_trials, num_agents]
+        targets = lambda_targets(reward, target_values, rollout.lengths, rollout.terminated, args.gamma, args.td_lambda)
 
         # Actors: climb along 1/T sum_t A_t grad log pi(a_t | o_t).
-        probs = torch.softmax(logits[:-1].double(), dim=-1).numpy()
-        advantage = counterfactual_advantages(values.detach().double().numpy(), probs, actions[:-1])
-        obs, weight = merge_steps(rollout.obs, rollout.actions, advantage * share, lengths, world.num_actions)
-        log_probs = torch.log_softmax(policy(torch.from_numpy(obs)), dim=-1)
-        loss = -(torch.from_numpy(weight) * log_probs).sum()
-        optimizer.step(torch.autograd.grad(loss, policy.params))
+        logits = team.policy(rollout.obs)
+        probs = in_every_step(torch.softmax(logits.detach().double(), dim=-1).numpy(), rollout.rows)
+        advantage = counterfactual_advantages(values.detach().double().numpy(), probs, rollout.actions)
+        loss = -(share * torch.from_numpy(advantage) * rollout.of_taken(torch.log_softmax(logits, dim=-1))).sum((0, 2))
+        update(optimizer, args.optimizer, loss.sum())
 
         # Critics: descend 1/T sum_t (y_t - Q(x_t, a_t))^2.
-        taken = values.gather(3, torch.from_numpy(actions[:-1, ..., None]))[..., 0]  # [T, num_trials, num_agents]
-        squares = torch.from_numpy(share) * (torch.from_numpy(targets) - taken) ** 2
-        critic_optimizer.step(torch.autograd.grad(squares.sum(), critic.params))
+        taken = values.gather(3, torch.from_numpy(rollout.actions)[..., None])[..., 0]  # [T, num_trials, num_agents]
+        squares = share * (torch.from_numpy(targets) - taken) ** 2
+        update(critic_optimizer, "adam", squares.sum())
         if (episode + 1) % args.target_critic_every == 0:
-            for kept, param in zip(target_critic.params, critic.params, strict=True):
-                kept.copy_(param.detach())
+            for kept, param in zip(team.target_critic.params, team.critic.params, strict=True):
+                kept.data.copy_(param.detach())
 
-        mean_value = REWARD_SCALE * (share * taken.detach().numpy()).sum(0).mean(1)
-        mean_square = squares.detach().numpy().sum(0).mean(1)
-        run.record(episode, rollout, value=mean_value, td_error=REWARD_SCALE * np.sqrt(mean_square))
-    run.finish(policy)
-    return SimpleNamespace(policy=policy, critic=critic, log=run.log)
-
-
-# --- run keeping ---
-# Arguments, directories, curves, checkpoints and evaluation: the same text in every script, and nothing that a method needs.
-
-METHOD = Path(__file__).stem
-HOUSEKEEPING = ("run_dir", "checkpoint_every", "resume", "overwrite", "save_model", "capture_video", "evaluate", "greedy")
-
-
-def resolve(args):
-    """The arguments with every None filled in from WORLDS and TUNED, and the worlds; UsageError for what is impossible."""
-    tuned = TUNED.get((args.env, getattr(args, "optimizer", "adam")), {})  # Q-learning has no policies, and Adam always
-    defaults = {**WORLDS.get(args.env, {}), **tuned, "run_dir": default_run_dir(args)}
-    values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
-    options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
-    envs.make_world(args.env, **options)
-    values["max_steps"] = options["max_steps"]
-    for name in LIMITS:
-        check_limits(name, values[name])
-    return type(args)(**values), envs.make_vec(args.env, args.num_trials, **options)
-
-
-def check_limits(name, values):
-    """UsageError if an argument, or one of its numbers if it has several, is outside its LIMITS."""
-    for value in values if isinstance(values, tuple) else [values]:
-        envs.check_number(f"--{name.replace('_', '-')}", value, *LIMITS[name])
-
-
-def default_run_dir(args):
-    """runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>]"""
-    words = [f"seed{args.seed}" + f"-{args.seed + args.num_trials - 1}" * (args.num_trials > 1)]
-    for field in fields(args):
-        value = getattr(args, field.name)
-        if value != field.default and field.name not in ("env", "seed", "num_trials", *HOUSEKEEPING):
-            words.append(f"{field.name}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
-    return Path("runs", args.env, METHOD, "-".join(words).replace("/", "_"))
-
-
-class Run:
-    """The directory of a run: curves, checkpoints, results.
-
-    arrays:     all arrays and tensors that training changes (of fixed shape; a checkpoint keeps them in this order)
-    generators: all random generators that training uses
-    figures:    names of the method's own curves, for which `record` takes values [num_trials]
-    """
-
-    def __init__(self, args, env, arrays, generators, figures=()):
-        self.args, self.env, self.generators = args, env, generators
-        self.log = envs.EpisodeLog(env.world, args.num_trials, args.num_episodes)
-        self.sums = {name: np.zeros(args.num_trials) for name in figures}  # since the last point of the curves
-        arrays = [*arrays, self.log.returns, self.log.lengths, self.log.outcomes, *self.sums.values()]
-        self.arrays = [torch.from_numpy(a) if isinstance(a, np.ndarray) else a.detach() for a in arrays]
-        self.settings = {"method": METHOD, **{k: v for k, v in asdict(args).items() if k not in HOUSEKEEPING}}
-        self.checkpoint, self.result = args.run_dir / "checkpoint.pt", args.run_dir / "episodes.npz"
-        self.start = 0
-        if args.resume:
-            self._load_checkpoint()
-        self._open_directory()
-        trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
-        self.writers = [SummaryWriter(str(trial), purge_step=self.start + 1, max_queue=1000) for trial in trials]
-
-    def _open_directory(self):
-        directory, resume = self.args.run_dir, self.args.resume
-        kept = [directory / name for name in ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif")]
-        if not (resume or self.args.overwrite) and any(path.exists() for path in kept):
-            held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
-            advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
-            raise envs.UsageError(f"{directory} holds {held}; {advice}start anew with --overwrite.")
-        about = {"method": METHOD, "args": asdict(self.args), "python": sys.version.split()[0]}
-        about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
-        git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
-        with contextlib.suppress(OSError):
-            about["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            for old in [] if resume else [*kept, *directory.glob("seed*/events.*")]:
-                old.unlink(missing_ok=True)
-            with envs.complete_file(directory / "args.json") as file:
-                file.write(json.dumps(about, indent=2, default=str).encode())
-        except OSError as error:
-            raise envs.UsageError(f"cannot write to {directory}: {error.strerror}.") from error
-
-    def _load_checkpoint(self):
-        if not self.checkpoint.exists():
-            raise envs.UsageError(f"there is nothing to resume: {self.args.run_dir} holds no checkpoint of an unfinished run.")
-        try:
-            saved = torch.load(self.checkpoint, weights_only=True)
-        except Exception as error:  # whatever can be wrong with a file
-            raise envs.UsageError(f"{self.checkpoint} cannot be read; start anew with --overwrite.") from error
-        for name, value in self.settings.items():
-            if (kept := saved["settings"].get(name)) != value:
-                raise envs.UsageError(f"--resume needs the same arguments, but {name} was {kept} and is now {value}.")
-        self.start = saved["episode"]
-        for array, kept in zip(self.arrays, saved["arrays"], strict=True):
-            array.copy_(kept)
-        for generator, state in zip(self.generators, saved["generators"], strict=True):
-            generator.bit_generator.state = state
-
-    def _save_checkpoint(self, episode):
-        for writer in self.writers:
-            writer.flush()
-        states = [generator.bit_generator.state for generator in self.generators]
-        with envs.complete_file(self.checkpoint) as file:
-            torch.save({"settings": self.settings, "episode": episode, "arrays": self.arrays, "generators": states}, file)
-
-    def episodes(self):
-        """Yield the number of every episode to play; between two of them write checkpoints and listen to Ctrl-C."""
-        first, last, stopped = self.start, self.args.num_episodes, []
-        handlers = {s: signal.signal(s, lambda number, _: stopped.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
-        self.bar = tqdm(initial=first, total=last, desc=f"{METHOD} {self.args.env}", unit="ep", mininterval=0.5)
-        self.clock = saved = time.monotonic()
-        pause = self.args.checkpoint_every
-        try:
-            for episode in range(first, last):
-                yield episode
-                self.bar.update()
-                if stopped or time.monotonic() - saved >= pause:
-                    began = time.monotonic()
-                    self._save_checkpoint(episode + 1)
-                    saved = time.monotonic()
-                    pause = max(self.args.checkpoint_every, 50 * (saved - began))
-                if stopped:
-                    self.bar.write(f"Stopped after {episode + 1} episodes; go on with --resume.", file=sys.stderr)
-                    sys.exit(128 + stopped[0])
-        finally:
-            self.bar.close()
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-    def record(self, episode, rollout, **figures):
-        """Keep one episode of every trial; every `log_every` episodes write the means since the last time to TensorBoard."""
-        self.log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
-        for name, values in figures.items():
-            self.sums[name] += values
-        done, every = episode + 1, self.args.log_every
-        if done % every:
-            return
-        recent, seconds = slice(done - every, done), time.monotonic() - self.clock
-        curves = self.log.means(recent)
-        steps = curves["episodic_length"] * every
-        curves.update(SPS=steps / seconds, **{name: total / every for name, total in self.sums.items()})
-        for name, values in curves.items():
-            for writer, value in zip(self.writers, values, strict=True):
-                writer.add_scalar(f"charts/{name}", value, done)
-        for total in self.sums.values():
-            total[:] = 0
-        recently = {"reward/step": f"{curves['reward_per_step'].mean():.2f}", "steps/s": f"{steps.sum() / seconds:.0f}"}
-        if self.env.world.outcome_names:
-            recently["trials at best"] = f"{self.log.share_at_best(recent):.0%}"
-        self.bar.set_postfix(recently, refresh=False)
-        self.clock = time.monotonic()
-
-    def finish(self, policy):
-        """Write what was asked for and, last of all, the file that marks the run as finished."""
-        args, directory = self.args, self.args.run_dir
-        for writer in self.writers:
-            writer.close()
-        if args.save_model:
-            team = {"method": METHOD, "env": args.env, "env_args": list(args.env_args), "max_steps": self.env.world.max_steps}
-            with envs.complete_file(directory / "policy.pt") as file:
-                torch.save({**team, "hidden": list(args.hidden), "params": [p.detach() for p in policy.params]}, file)
-        if args.capture_video:
-            play(self.env, policy, args, 1, directory / "team.gif")
-        with envs.complete_file(self.result) as file:
-            np.savez(file, returns=self.log.returns, lengths=self.log.lengths, outcomes=self.log.outcomes)
-        self.checkpoint.unlink(missing_ok=True)
-        print(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {self.log.summary()}")
-
-
-def play(env, policy, args, num_episodes, video):
-    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
-    rng, rollout, frames = np.random.default_rng(args.seed), Rollout(env), []
-    log = envs.EpisodeLog(env.world, env.num_envs, num_episodes)
-    for episode in range(num_episodes):
-        uniforms = None if args.greedy else rng.random((env.num_envs, env.world.max_steps, env.world.num_agents))
-        collect(env, policy, uniforms, rollout, frames if episode == 0 else None)
-        log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
-    try:
-        envs.save_gif(video, frames)
-    except OSError as error:
-        raise envs.UsageError(f"cannot write {video}: {error.strerror}.") from error
-    return log
-
-
-def load_teams(path):
-    """The worlds and the policies of a policy.pt that --save-model wrote; UsageError for anything else."""
-    if not path.exists():
-        raise envs.UsageError(f"there is no file {path}.")
-    try:
-        saved = torch.load(path, weights_only=True)
-        world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
-        teams = len(saved["params"][0]) // world.num_agents
-        sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
-        policy = Policy([np.random.default_rng(0)] * teams, world.num_agents, sizes)
-        for param, kept in zip(policy.params, saved["params"], strict=True):
-            param.data.copy_(kept)
-    except Exception as error:  # whatever can be wrong with a file
-        raise envs.UsageError(f"{path} is not a policy.pt that --save-model wrote.") from error
-    return envs.GridVectorEnv(world, teams), policy
-
-
-def evaluate(args):
-    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
-    torch.set_num_threads(1)
-    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
-    check_limits("num_episodes", num_episodes)
-    check_limits("seed", args.seed)
-    env, policy = load_teams(args.evaluate)
-    log = play(env, policy, args, num_episodes, video)
-    print(f"{args.evaluate}: {num_episodes} episodes of {env.num_envs} teams, {log.summary(share=1.0)}; one of them in {video}")
-
-
-def main():
-    try:
-        args = tyro.cli(Args, description=__doc__)
-        evaluate(args) if args.evaluate else train(args)
-    except envs.UsageError as error:
-        print(f"{METHOD}.py: {error}", file=sys.stderr)
-        sys.exit(2)
+        mean_value = REWARD_SCALE * (share * taken.detach()).sum(0).mean(1).numpy()
+        td_error = REWARD_SCALE * np.sqrt(squares.detach().sum(0).mean(1).numpy())
+        run.record(episode, rollout, policy_loss=loss, value=mean_value, td_error=td_error)
+    return run.finish()
 
 
 if __name__ == "__main__":
-    main()
+    main(Args, build, train)

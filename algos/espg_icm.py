@@ -16,31 +16,20 @@ Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and
     python algos/espg_icm.py --env pushbox --seed 3
 """
 
-import contextlib
-import json
-import signal
-import subprocess
 import sys
-import time
-from copy import copy
-from dataclasses import asdict, dataclass, fields
-from importlib.metadata import version
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-import tyro
 from numba import njit
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import envs
-
-sys.modules.setdefault(Path(__file__).stem, sys.modules[__name__])  # where numba's cache looks after an import by this name
+from envs import Rollout, distinct_rows, in_every_step
+from envs.run import AtLeast, Between, Run, RunArgs, generators_of, main, resolve
 
 # Table 1 of the paper.
 WORLDS = {
@@ -63,68 +52,31 @@ TUNED = {
     ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, beta=1.0, slots=10),
 }
-# The lowest and highest value of every number that makes sense.
-LIMITS = dict(
-    **dict(seed=(0, np.inf), num_trials=(1, np.inf), num_episodes=(1, np.inf), max_steps=(1, np.inf), hidden=(1, np.inf)),
-    **dict(gamma=(0, 1), learning_rate=(0, np.inf), log_every=(1, np.inf), checkpoint_every=(0, np.inf)),
-    **dict(beta=(0, np.inf), icm_learning_rate=(0, np.inf), forward_weight=(0, 1)),
-    **dict(features=(1, np.inf), icm_hidden=(1, np.inf)),
-    **dict(slots=(0, np.inf)),
-)
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.3, slots=10)  # what a world of your own gets
 
 
 @dataclass
-class Args:
-    env: str = "pushbox"
-    """world: cleaner, findtreasure, gotogether, movebox or pushbox"""
-    env_args: tuple[str, ...] = ()
-    """options of the world, such as size=6 (envs/<world>.py lists them)"""
-    seed: int = 1
-    """seed of the first trial; trial k has seed + k"""
-    num_trials: int = 1
-    """independent trials, trained side by side in this process"""
-    num_episodes: int | None = None
-    """training episodes of each trial (None: Table 1); with --evaluate, episodes to play (None: 100)"""
-    max_steps: int | None = None
-    """time limit of an episode in steps (None: Table 1)"""
-    hidden: tuple[int, ...] | None = None
-    """widths of the hidden layers (None: Table 1)"""
-    gamma: float | None = None
-    """discount factor (None: Table 1)"""
+class Args(RunArgs):
+    hidden: Annotated[tuple[int, ...] | None, AtLeast(1)] = None
+    """widths of the hidden layers (None: Table 1; 64 in other worlds)"""
+    gamma: Annotated[float | None, Between(0, 1)] = None
+    """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
-    learning_rate: float | None = None
-    """step size of the policies (None: tuned for world and optimiser)"""
-    log_every: int = 100
-    """episodes between two points of the TensorBoard curves, which show the mean since the last point"""
-    run_dir: Path | None = None
-    """where the run's files go (None: runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>])"""
-    checkpoint_every: float = 60.0
-    """seconds between two checkpoints (longer where writing one would take over 2 % of the time)"""
-    resume: bool = False
-    """go on from the checkpoint in the run's directory"""
-    overwrite: bool = False
-    """start anew even if the run's directory holds results"""
-    save_model: bool = False
-    """write the trained policies to policy.pt"""
-    capture_video: bool = False
-    """write one episode of the first trial's trained team to team.gif"""
-    evaluate: Path | None = None
-    """do not train: play the teams of this policy.pt, print how their episodes end and write a GIF beside it"""
-    greedy: bool = False
-    """with --evaluate: take the likeliest actions instead of drawing from the policies"""
-    beta: float | None = None
-    """weight of the exploration bonus, in units of reward (beta of Eq. 9; None: tuned for world and optimiser)"""
-    icm_learning_rate: float = 1e-3
+    learning_rate: Annotated[float | None, AtLeast(0)] = None
+    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    beta: Annotated[float | None, AtLeast(0)] = None
+    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.3 in other worlds)"""
+    icm_learning_rate: Annotated[float, AtLeast(0)] = 1e-3
     """step size of the curiosity module, which always has a persistent Adam"""
-    forward_weight: float = 0.2
+    forward_weight: Annotated[float, Between(0, 1)] = 0.2
     """weight of the forward model's loss beside the inverse model's (beta in Eq. 7 of Pathak et al.), between 0 and 1"""
-    features: int = 32
+    features: Annotated[int, AtLeast(1)] = 32
     """features of a joint observation (the length of phi)"""
-    icm_hidden: tuple[int, ...] = (64,)
+    icm_hidden: Annotated[tuple[int, ...], AtLeast(1)] = (64,)
     """widths of the hidden layers of the inverse and the forward model (those of phi: --hidden)"""
-    slots: int | None = None
-    """episodes that the memory keeps for each terminal state (None: tuned for world and optimiser); 0 switches it off"""
+    slots: Annotated[int | None, AtLeast(0)] = None
+    """episodes that the memory keeps for each terminal state, 0: none (None: tuned for world and optimiser; 10 in others)"""
 
 
 class StackedMLP:
@@ -140,140 +92,13 @@ class StackedMLP:
                 self.params.append(torch.from_numpy(draws).float().requires_grad_())
 
     def __call__(self, x):
-        """x [num_nets, batch, in] -> [num_nets, batch, out]."""
+        """x [num_nets, batch, in], a tensor or an array -> [num_nets, batch, out]."""
+        x = torch.as_tensor(x)
         for layer in range(0, len(self.params), 2):
             if layer > 0:
                 x = torch.relu(x)
             x = torch.baddbmm(self.params[layer + 1], x, self.params[layer])
         return x
-
-    def subset(self, nets):
-        """A copy of some of the networks."""
-        part = copy(self)
-        part.params = [param[nets] for param in self.params]
-        return part
-
-
-Policy = StackedMLP  # what agents act with: observations to logits of the actions
-
-
-@njit(cache=True, error_model="numpy")  # which lets divisions be vectorised
-def sign_step(param, grad, active, learning_rate):
-    """One step of sign descent, in place; param and grad [num_nets, num_weights], the mask active [num_nets]."""
-    real = param.dtype.type  # single precision stays single
-    rate, tiny = real(learning_rate), real(1e-8)
-    for net in np.flatnonzero(active):
-        for j in range(param.shape[1]):
-            g = grad[net, j]
-            param[net, j] -= rate * g / (abs(g) + tiny)
-
-
-@njit(cache=True, error_model="numpy")
-def adam_step(param, grad, first, second, count, active, learning_rate):
-    """One step of Adam, in place; param, grad and both moments [num_nets, num_weights], count and active [num_nets]."""
-    real = param.dtype.type
-    rate, tiny, weight1, weight2 = real(learning_rate), real(1e-8), real(0.1), real(0.001)
-    for net in np.flatnonzero(active):
-        correction1, correction2 = real(1 - 0.9 ** count[net]), real(1 - 0.999 ** count[net])
-        for j in range(param.shape[1]):
-            g = grad[net, j]
-            first[net, j] += weight1 * (g - first[net, j])
-            second[net, j] += weight2 * (g * g - second[net, j])
-            param[net, j] -= rate * (first[net, j] / correction1) / (np.sqrt(second[net, j] / correction2) + tiny)
-
-
-class StackedOptimizer:
-    """Gradient descent for stacked networks, every network on its own.
-
-    "sign": w -= lr g / (|g| + 1e-8), which is exactly the first step of a fresh Adam (the authors create one in every update).
-    "adam": Adam (Kingma & Ba, 2015) with betas 0.9 and 0.999; moments and step count belong to the network.
-    """
-
-    def __init__(self, params, kind, learning_rate):
-        self.params, self.learning_rate = params, learning_rate
-        self.count = np.zeros(len(params[0]), np.int64)
-        self.moments = [[np.zeros_like(p.detach().numpy()) for _ in range(2 if kind == "adam" else 0)] for p in params]
-        self.state = [self.count, *(moment for moments in self.moments for moment in moments)]
-
-    def step(self, grads, active=None):
-        """One step against the gradients; networks outside the mask `active` (bool [num_nets], None: all) stay untouched."""
-        active = np.ones(len(self.count), bool) if active is None else active.numpy()
-        self.count += active
-        for param, grad, moments in zip(self.params, grads, self.moments, strict=True):
-            arrays = [array.reshape(len(active), -1) for array in (param.detach().numpy(), grad.numpy(), *moments)]
-            if moments:
-                adam_step(*arrays, self.count, active, self.learning_rate)
-            else:
-                sign_step(*arrays, active, self.learning_rate)
-
-
-@njit(cache=True)
-def sample_actions(logits, uniforms):
-    """Draw from softmax(logits) by inverting the distribution function.
-
-    logits [num_trials, num_agents, num_actions], uniforms in [0, 1) [num_trials, num_agents] -> actions, shaped as uniforms.
-    """
-    actions = np.empty(uniforms.shape, np.int64)
-    for k in range(logits.shape[0]):
-        for i in range(logits.shape[1]):
-            highest = logits[k, i].max()
-            total = 0.0
-            for logit in logits[k, i]:
-                total += np.exp(np.float64(logit - highest))
-            a, remaining = -1, uniforms[k, i] * total
-            while remaining >= 0.0 and a < logits.shape[2] - 1:
-                a += 1
-                remaining -= np.exp(np.float64(logits[k, i, a] - highest))
-            actions[k, i] = a
-    return actions
-
-
-class Rollout:
-    """One episode of every trial, time first; a row beyond a trial's length counts for nothing.
-
-    Only `obs` has one row more, for what was seen after the last step (critics ask for it where the time limit cuts).
-    """
-
-    def __init__(self, env):
-        world, shape = env.world, (env.world.max_steps, env.num_envs)
-        self.obs = np.zeros((world.max_steps + 1, env.num_envs, world.num_agents, world.obs_dim), np.float32)
-        self.actions = np.zeros((*shape, world.num_agents), np.int64)
-        self.reward = np.zeros(shape)
-        self.lengths = np.zeros(env.num_envs, np.int64)
-        self.outcomes = np.zeros(env.num_envs, np.int64)
-
-
-@torch.no_grad()
-def collect(env, policy, uniforms, rollout, frames=None):
-    """Play one episode in every world, in lock step until the last has ended, and write it into `rollout`.
-
-    The agents draw their actions with `uniforms` [num_trials, max_steps, num_agents], or take the likeliest ones if it is None.
-    Pictures of the first world are appended to `frames` if it is a list.
-    """
-    num_agents = env.world.num_agents
-    rollout.obs[0], _ = env.reset()
-    if frames is not None:
-        frames.append(env.draw(0, caption="start"))
-    rollout.lengths[:] = 0
-    running, playing, num_playing, actor = np.ones(env.num_envs, bool), slice(None), env.num_envs, policy
-    actions = np.zeros(rollout.actions.shape[1:], np.int64)
-    for t in range(env.world.max_steps):
-        logits = actor(torch.from_numpy(rollout.obs[t][playing]).view(num_playing * num_agents, 1, -1))
-        logits = logits.view(num_playing, num_agents, -1).numpy()
-        actions[playing] = logits.argmax(-1) if uniforms is None else sample_actions(logits, uniforms[playing, t])
-        rollout.actions[t] = actions
-        rollout.lengths += running
-        rollout.obs[t + 1], rollout.reward[t], terminated, truncated, info = env.step(actions)
-        if frames is not None and running[0]:
-            frames.append(env.draw(0, caption=f"step {t + 1}   reward {rollout.reward[t, 0]:+g}"))
-        running = ~(terminated | truncated)
-        num_running = np.count_nonzero(running)
-        if num_running == 0:
-            break
-        if 2 * num_running <= num_playing:  # acting takes as long as there are networks: let those that wait go
-            playing, num_playing = np.flatnonzero(running), num_running
-            actor = policy.subset((playing[:, None] * num_agents + np.arange(num_agents)).ravel())
-    rollout.outcomes[:] = info["outcome"]
 
 
 @njit(cache=True)
@@ -289,90 +114,31 @@ def discounted_returns(reward, lengths, gamma):
     return returns
 
 
-@njit(cache=True)
-def merge_steps(obs, actions, weights, lengths, num_actions):
-    """Add up the weights of equal steps: sum_t w_t log pi(a_t | o_t) needs every distinct observation only once.
+def update(optimizer, kind, loss):
+    """One step down the gradient of a loss summed over all trials, whose networks it moves independently of each other.
 
-    obs [T, num_trials, num_agents, obs_dim], actions and weights [T, num_trials, num_agents], lengths [num_trials]
-    -> distinct observations [num_nets, U, obs_dim] and the weights of all actions there [num_nets, U, num_actions], 0 in the
-    rows that a network with fewer than U distinct observations leaves over. There is one network per trial and agent.
+    "adam": a persistent Adam. "sign": a new Adam in every update, as in the authors' scripts. The first step of an Adam is
+    lr g / (|g| + 1e-8), so this is descent along the sign of the gradient.
     """
-    _, trials, agents, dim = obs.shape
-    distinct = np.zeros((trials * agents, lengths.max(), dim), np.float32)
-    weight = np.zeros((trials * agents, lengths.max(), num_actions))
-    buckets = 2
-    while buckets < 2 * lengths.max():
-        buckets *= 2
-    bits = obs.view(np.int32)
-    most = 0
-    for k in range(trials):
-        for i in range(agents):
-            net, found = k * agents + i, 0
-            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
-            for t in range(lengths[k]):
-                bucket = 0
-                for j in range(dim):
-                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
-                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
-                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
-                    bucket = (bucket + 1) & (buckets - 1)
-                if row_in[bucket] < 0:
-                    row_in[bucket] = found
-                    distinct[net, found] = obs[t, k, i]
-                    found += 1
-                weight[net, row_in[bucket], actions[t, k, i]] += weights[t, k, i]
-            most = max(most, found)
-    return distinct[:, :most].copy(), weight[:, :most].astype(np.float32)
-
-
-@njit(cache=True)
-def distinct_observations(obs, lengths):
-    """What the networks have to see of an episode: every distinct observation, the one after the last step too, but only once.
-
-    obs [T + 1, num_trials, num_agents, obs_dim], lengths [num_trials] -> distinct observations [num_nets, U, obs_dim], 0 in the
-    rows that a network with fewer than U leaves over, and each step's row among them [T + 1, num_trials, num_agents].
-    """
-    _, trials, agents, dim = obs.shape
-    distinct = np.zeros((trials * agents, lengths.max() + 1, dim), np.float32)
-    rows = np.zeros((lengths.max() + 1, trials, agents), np.int64)
-    buckets = 2
-    while buckets < 2 * lengths.max() + 2:
-        buckets *= 2
-    bits = obs.view(np.int32)
-    most = 0
-    for k in range(trials):
-        for i in range(agents):
-            net, found = k * agents + i, 0
-            row_in = np.full(buckets, -1)  # a hash table with open addressing: bucket -> row of `distinct`
-            for t in range(lengths[k] + 1):
-                bucket = 0
-                for j in range(dim):
-                    bucket = (bucket ^ bits[t, k, i, j]) * 16777619
-                bucket = (bucket ^ (bucket >> 20)) & (buckets - 1)
-                while row_in[bucket] >= 0 and not np.array_equal(distinct[net, row_in[bucket]], obs[t, k, i]):
-                    bucket = (bucket + 1) & (buckets - 1)
-                if row_in[bucket] < 0:
-                    row_in[bucket] = found
-                    distinct[net, found] = obs[t, k, i]
-                    found += 1
-                rows[t, k, i] = row_in[bucket]
-            most = max(most, found)
-    return distinct[:, :most].copy(), rows
+    if kind == "sign":
+        optimizer.state.clear()
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()
 
 
 class IntrinsicCuriosity:
     """The bonus of Pathak et al. (2017; their Eqs. 2-7): what a central forward model fails to foresee of learnt features."""
 
-    def __init__(self, generators, env, hidden, features, icm_hidden, forward_weight, learning_rate):
-        world, self.forward_weight = env.world, forward_weight
+    def __init__(self, generators, world, args):
+        self.forward_weight, features = args.forward_weight, args.features
         self.actions_shape = (world.num_agents, world.num_actions)
         actions_dim = world.num_agents * world.num_actions
-        self.encoder = StackedMLP(generators, 1, [world.num_agents * world.obs_dim, *hidden, features])
-        self.inverse_model = StackedMLP(generators, 1, [2 * features, *icm_hidden, actions_dim])
-        self.forward_model = StackedMLP(generators, 1, [features + actions_dim, *icm_hidden, features])
-        params = [*self.encoder.params, *self.inverse_model.params, *self.forward_model.params]
-        self.optimizer = StackedOptimizer(params, "adam", learning_rate)
-        self.state = [*params, *self.optimizer.state]
+        self.encoder = StackedMLP(generators, 1, [world.num_agents * world.obs_dim, *args.hidden, features])
+        self.inverse_model = StackedMLP(generators, 1, [2 * features, *args.icm_hidden, actions_dim])
+        self.forward_model = StackedMLP(generators, 1, [features + actions_dim, *args.icm_hidden, features])
+        self.params = [*self.encoder.params, *self.inverse_model.params, *self.forward_model.params]
+        self.optimizer = torch.optim.Adam(self.params, lr=args.icm_learning_rate, fused=True)
 
     def bonus(self, pairs, lengths, seen):
         """1/2 ||phihat(o') - phi(o')||^2 of each step of an episode (Eq. 6), [T, num_trials, 1]; then learn from the episode.
@@ -385,9 +151,8 @@ class IntrinsicCuriosity:
         pairs = torch.from_numpy(pairs).transpose(0, 1).reshape(len(lengths), -1, num_agents, pairs.shape[3] // num_agents)
         actions = pairs[..., :num_actions]  # one-hot a, [num_trials, T, num_agents, num_actions]
         joint_action = actions.flatten(2)
-        distinct, rows = map(torch.from_numpy, distinct_observations(seen, lengths))
-        phi = self.encoder(distinct)  # [num_trials, U, features]
-        phi = phi.gather(1, rows.transpose(0, 1).expand(-1, -1, phi.shape[2]))  # [num_trials, T + 1, features]
+        distinct, rows = distinct_rows(seen, lengths + 1)
+        phi = in_every_step(self.encoder(distinct), rows)[:, :, 0].transpose(0, 1)  # [num_trials, T + 1, features]
         phi, next_phi = phi[:, :-1], phi[:, 1:]
 
         # Eqs. 2-3: the inverse model, log p(a_i | phi(o), phi(o')) of each agent.
@@ -403,7 +168,7 @@ class IntrinsicCuriosity:
         played = (torch.arange(actions.shape[1]) < torch.from_numpy(lengths)[:, None]).double()  # [num_trials, T]
         share = played / torch.from_numpy(lengths)[:, None]
         loss = (share * ((1 - self.forward_weight) * inverse_error + self.forward_weight * forward_error)).sum()
-        self.optimizer.step(torch.autograd.grad(loss, self.optimizer.params))
+        update(self.optimizer, "adam", loss)
 
         bonus = (played * forward_error.detach()).T[:, :, None].numpy()
         right = (taken == log_probs.amax(3)).double().mean(2)
@@ -413,9 +178,8 @@ class IntrinsicCuriosity:
 class SelectiveMemory:
     """The best episodes of each terminal state (Section 3.2), kept jointly for the team, and their gradient."""
 
-    def __init__(self, env, slots):
-        world = env.world
-        shape = (env.num_envs, len(world.outcome_names) + 1, slots)  # outcome 0, the time limit, is a terminal state too
+    def __init__(self, world, num_trials, slots):
+        shape = (num_trials, len(world.outcome_names) + 1, slots)  # outcome 0, the time limit, is a terminal state too
         self.value = np.full(shape, -np.inf)  # Psi*, the discounted return of the original reward
         self.lengths = np.zeros(shape, np.int64)
         self.obs = np.zeros((*shape, world.max_steps, world.num_agents, world.obs_dim), np.float32)
@@ -423,7 +187,7 @@ class SelectiveMemory:
         self.returns = np.zeros((*shape, world.max_steps))
         self.num_actions = world.num_actions
         self.state = [self.value, self.lengths, self.obs, self.actions, self.returns]
-        self.replays = [None] * env.num_envs
+        self.replays = [None] * num_trials
 
     def remember(self, rollout, returns):
         """Keep each trial's episode if it is better than the worst one kept for its terminal state.
@@ -435,15 +199,17 @@ class SelectiveMemory:
             if values.size and returns[0, k] > values.min():
                 slot = k, outcome, values.argmin()
                 self.value[slot], self.lengths[slot] = returns[0, k], length
-                self.obs[slot][:length], self.actions[slot][:length] = rollout.obs[:length, k], rollout.actions[:length, k]
+                self.obs[slot][:length] = rollout.all_obs[:length, k]
+                self.actions[slot][:length] = rollout.actions[:length, k]
                 self.returns[slot][:length] = returns[:length, k]
                 self.replays[k] = None
 
     def replay(self):
-        """The steps of the second term of Eq. 16, merged as by `merge_steps`: sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j.
+        """The second term of Eq. 16, sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j, as weights of log pi(a | o).
 
-        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. What is stored
-        does not change, so the steps are merged again only when a better episode has come.
+        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. Every distinct
+        observation is there once: obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
+        What is stored does not change, so the steps are merged again only when a better episode has come.
         """
         changed = [k for k, replay in enumerate(self.replays) if replay is None]
         for k in changed:
@@ -459,286 +225,64 @@ class SelectiveMemory:
         return self.stacked
 
     def _merge(self, k):
-        """The steps of trial k's episodes, each weighted by w_i G*_t / T_i."""
+        """Trial k's part of `replay`: every step has the weight w_i G*_t / T_i."""
         value = np.where(self.value[k] > 0, self.value[k], 0.0)  # [outcomes, slots]
         scale = value / (value.sum() or 1.0) / np.maximum(self.lengths[k], 1)
         steps = np.arange(self.returns.shape[-1]) < (self.lengths[k] * (value > 0))[:, :, None]  # [outcomes, slots, max_steps]
-        obs, actions, weights = self.obs[k][steps], self.actions[k][steps], (scale[:, :, None] * self.returns[k])[steps]
-        weights = np.repeat(weights[:, None], obs.shape[1], axis=1)
-        return merge_steps(obs[:, None], actions[:, None], weights[:, None], np.array([len(obs)]), self.num_actions)
+        actions, weights = self.actions[k][steps], (scale[:, :, None] * self.returns[k])[steps]  # [N, num_agents], [N]
+        obs, rows = distinct_rows(self.obs[k][steps][:, None], np.array([len(weights)]))  # rows [N, 1, num_agents]
+        summed = np.zeros((*obs.shape[:2], self.num_actions))  # [num_agents, M, num_actions]
+        np.add.at(summed, (np.arange(len(obs)), rows[:, 0], actions), weights[:, None])
+        return obs, summed
+
+
+def build(args, world, init):
+    """All that learns or remembers, for all trials; `init` are the generators of the first weights."""
+    return SimpleNamespace(
+        policy=StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions]),
+        curiosity=IntrinsicCuriosity(init, world, args),
+        memory=SelectiveMemory(world, len(init), args.slots),
+    )
 
 
 def train(args: Args):
     """Train `num_trials` teams side by side; returns the policies, the method's parts and the log of all episodes."""
-    torch.set_num_threads(1)
-    args, env = resolve(args)
-    world, num_agents = env.world, env.world.num_agents
-    seeds = [np.random.SeedSequence(args.seed + k).spawn(3) for k in range(args.num_trials)]
-    init, act, _ = [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
-
-    policy = Policy(init, num_agents, [world.obs_dim, *args.hidden, world.num_actions])
-    optimizer = StackedOptimizer(policy.params, args.optimizer, args.learning_rate)
+    args, world = resolve(args, WORLDS, TUNED, OTHER)
+    init, act, _ = generators_of(args)
+    team = build(args, world, init)
+    optimizer = torch.optim.Adam(team.policy.params, lr=args.learning_rate, fused=True)
+    rollout = Rollout(world, args.num_trials)
+    run = Run(args, world, team, optimizers=[optimizer, team.curiosity.optimizer], generators=act)
     one_hot = np.eye(world.num_actions, dtype=np.float32)
-    pair_dim = num_agents * (world.num_actions + world.obs_dim)
-    curiosity = IntrinsicCuriosity(
-        init, env, args.hidden, args.features, args.icm_hidden, args.forward_weight, args.icm_learning_rate
-    )
-    memory = SelectiveMemory(env, args.slots)
-    rollout = Rollout(env)
-    uniforms = np.empty((args.num_trials, world.max_steps, num_agents))
-    arrays = [*policy.params, *optimizer.state, *curiosity.state, *memory.state]
-    run = Run(args, env, arrays, generators=act, figures=("bonus", "inverse_loss", "inverse_accuracy"))
 
     for episode in run.episodes():
-        # Play one episode of every trial.
-        for generator, row in zip(act, uniforms, strict=True):
-            generator.random(out=row)
-        collect(env, policy, uniforms, rollout)
-        lengths, longest = rollout.lengths, rollout.lengths.max()
-        reward = np.repeat(rollout.reward[:longest, :, None], num_agents, axis=2)  # [T, num_trials, num_agents]
+        rollout.play(team.policy.params, act)
 
         # Augment the reward with the team's exploration bonus, Eq. 9, the same for all agents, and learn from the steps.
-        pairs = np.concatenate([one_hot[rollout.actions[:longest]], rollout.obs[:longest]], axis=3)  # each agent's u
-        pairs = pairs.reshape(longest, args.num_trials, 1, pair_dim)  # the team's u
-        seen = rollout.obs[: longest + 1].reshape(longest + 1, args.num_trials, 1, -1)  # what the team saw
-        bonus, inverse_loss, inverse_accuracy = curiosity.bonus(pairs, lengths, seen)
-        augmented = reward + args.beta * bonus
+        pairs = np.concatenate([one_hot[rollout.actions], rollout.all_obs[:-1]], axis=3)
+        pairs = pairs.reshape(*pairs.shape[:2], 1, -1)  # the team's u
+        seen = rollout.all_obs.reshape(*rollout.all_obs.shape[:2], 1, -1)  # what the team saw
+        bonus, inverse_loss, inverse_accuracy = team.curiosity.bonus(pairs, rollout.lengths, seen)  # bonus [T, num_trials, 1]
+        augmented = rollout.reward + args.beta * bonus
 
         # Update the selective memory, by the original reward.
-        memory.remember(rollout, discounted_returns(reward, lengths, args.gamma)[:, :, 0])
+        team.memory.remember(rollout, discounted_returns(rollout.reward, rollout.lengths, args.gamma)[:, :, 0])
 
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14, and the memory's gradient, Eq. 16.
-        returns = discounted_returns(augmented, lengths, args.gamma)
-        obs, weight = merge_steps(rollout.obs, rollout.actions, returns / lengths[:, None], lengths, world.num_actions)
-        obs, weight = (np.concatenate(parts, axis=1) for parts in zip((obs, weight), memory.replay(), strict=True))
-        log_probs = torch.log_softmax(policy(torch.from_numpy(obs)), dim=-1)
-        loss = -(torch.from_numpy(weight) * log_probs).sum()
-        optimizer.step(torch.autograd.grad(loss, policy.params))
+        returns = discounted_returns(augmented, rollout.lengths, args.gamma)
+        weights = torch.from_numpy(returns / rollout.lengths[:, None])  # [T, num_trials, num_agents]
+        memory_obs, memory_weights = team.memory.replay()
+        log_probs = torch.log_softmax(team.policy(np.concatenate([rollout.obs, memory_obs], axis=1)), dim=-1)
+        own, remembered = log_probs.split([rollout.obs.shape[1], memory_obs.shape[1]], dim=1)
+        loss = -(weights * rollout.of_taken(own)).sum((0, 2))  # [num_trials]
+        loss = loss - (torch.from_numpy(memory_weights) * remembered).view(args.num_trials, -1).sum(1)
+        update(optimizer, args.optimizer, loss.sum())
 
-        mean_bonus = bonus.sum((0, 2)) / (lengths * bonus.shape[2])
-        run.record(episode, rollout, bonus=mean_bonus, inverse_loss=inverse_loss, inverse_accuracy=inverse_accuracy)
-    run.finish(policy)
-    return SimpleNamespace(policy=policy, curiosity=curiosity, memory=memory, log=run.log)
-
-
-# --- run keeping ---
-# Arguments, directories, curves, checkpoints and evaluation: the same text in every script, and nothing that a method needs.
-
-METHOD = Path(__file__).stem
-HOUSEKEEPING = ("run_dir", "checkpoint_every", "resume", "overwrite", "save_model", "capture_video", "evaluate", "greedy")
-
-
-def resolve(args):
-    """The arguments with every None filled in from WORLDS and TUNED, and the worlds; UsageError for what is impossible."""
-    tuned = TUNED.get((args.env, getattr(args, "optimizer", "adam")), {})  # Q-learning has no policies, and Adam always
-    defaults = {**WORLDS.get(args.env, {}), **tuned, "run_dir": default_run_dir(args)}
-    values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}
-    options = {"max_steps": values["max_steps"], **envs.parse_options(args.env_args)}
-    envs.make_world(args.env, **options)
-    values["max_steps"] = options["max_steps"]
-    for name in LIMITS:
-        check_limits(name, values[name])
-    return type(args)(**values), envs.make_vec(args.env, args.num_trials, **options)
-
-
-def check_limits(name, values):
-    """UsageError if an argument, or one of its numbers if it has several, is outside its LIMITS."""
-    for value in values if isinstance(values, tuple) else [values]:
-        envs.check_number(f"--{name.replace('_', '-')}", value, *LIMITS[name])
-
-
-def default_run_dir(args):
-    """runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>]"""
-    words = [f"seed{args.seed}" + f"-{args.seed + args.num_trials - 1}" * (args.num_trials > 1)]
-    for field in fields(args):
-        value = getattr(args, field.name)
-        if value != field.default and field.name not in ("env", "seed", "num_trials", *HOUSEKEEPING):
-            words.append(f"{field.name}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
-    return Path("runs", args.env, METHOD, "-".join(words).replace("/", "_"))
-
-
-class Run:
-    """The directory of a run: curves, checkpoints, results.
-
-    arrays:     all arrays and tensors that training changes (of fixed shape; a checkpoint keeps them in this order)
-    generators: all random generators that training uses
-    figures:    names of the method's own curves, for which `record` takes values [num_trials]
-    """
-
-    def __init__(self, args, env, arrays, generators, figures=()):
-        self.args, self.env, self.generators = args, env, generators
-        self.log = envs.EpisodeLog(env.world, args.num_trials, args.num_episodes)
-        self.sums = {name: np.zeros(args.num_trials) for name in figures}  # since the last point of the curves
-        arrays = [*arrays, self.log.returns, self.log.lengths, self.log.outcomes, *self.sums.values()]
-        self.arrays = [torch.from_numpy(a) if isinstance(a, np.ndarray) else a.detach() for a in arrays]
-        self.settings = {"method": METHOD, **{k: v for k, v in asdict(args).items() if k not in HOUSEKEEPING}}
-        self.checkpoint, self.result = args.run_dir / "checkpoint.pt", args.run_dir / "episodes.npz"
-        self.start = 0
-        if args.resume:
-            self._load_checkpoint()
-        self._open_directory()
-        trials = [args.run_dir / f"seed{args.seed + k}" for k in range(args.num_trials)]
-        self.writers = [SummaryWriter(str(trial), purge_step=self.start + 1, max_queue=1000) for trial in trials]
-
-    def _open_directory(self):
-        directory, resume = self.args.run_dir, self.args.resume
-        kept = [directory / name for name in ("episodes.npz", "checkpoint.pt", "policy.pt", "team.gif")]
-        if not (resume or self.args.overwrite) and any(path.exists() for path in kept):
-            held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
-            advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
-            raise envs.UsageError(f"{directory} holds {held}; {advice}start anew with --overwrite.")
-        about = {"method": METHOD, "args": asdict(self.args), "python": sys.version.split()[0]}
-        about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
-        git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40"]
-        with contextlib.suppress(OSError):
-            about["commit"] = subprocess.run(git, capture_output=True, text=True).stdout.strip()
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-            for old in [] if resume else [*kept, *directory.glob("seed*/events.*")]:
-                old.unlink(missing_ok=True)
-            with envs.complete_file(directory / "args.json") as file:
-                file.write(json.dumps(about, indent=2, default=str).encode())
-        except OSError as error:
-            raise envs.UsageError(f"cannot write to {directory}: {error.strerror}.") from error
-
-    def _load_checkpoint(self):
-        if not self.checkpoint.exists():
-            raise envs.UsageError(f"there is nothing to resume: {self.args.run_dir} holds no checkpoint of an unfinished run.")
-        try:
-            saved = torch.load(self.checkpoint, weights_only=True)
-        except Exception as error:  # whatever can be wrong with a file
-            raise envs.UsageError(f"{self.checkpoint} cannot be read; start anew with --overwrite.") from error
-        for name, value in self.settings.items():
-            if (kept := saved["settings"].get(name)) != value:
-                raise envs.UsageError(f"--resume needs the same arguments, but {name} was {kept} and is now {value}.")
-        self.start = saved["episode"]
-        for array, kept in zip(self.arrays, saved["arrays"], strict=True):
-            array.copy_(kept)
-        for generator, state in zip(self.generators, saved["generators"], strict=True):
-            generator.bit_generator.state = state
-
-    def _save_checkpoint(self, episode):
-        for writer in self.writers:
-            writer.flush()
-        states = [generator.bit_generator.state for generator in self.generators]
-        with envs.complete_file(self.checkpoint) as file:
-            torch.save({"settings": self.settings, "episode": episode, "arrays": self.arrays, "generators": states}, file)
-
-    def episodes(self):
-        """Yield the number of every episode to play; between two of them write checkpoints and listen to Ctrl-C."""
-        first, last, stopped = self.start, self.args.num_episodes, []
-        handlers = {s: signal.signal(s, lambda number, _: stopped.append(number)) for s in (signal.SIGINT, signal.SIGTERM)}
-        self.bar = tqdm(initial=first, total=last, desc=f"{METHOD} {self.args.env}", unit="ep", mininterval=0.5)
-        self.clock = saved = time.monotonic()
-        pause = self.args.checkpoint_every
-        try:
-            for episode in range(first, last):
-                yield episode
-                self.bar.update()
-                if stopped or time.monotonic() - saved >= pause:
-                    began = time.monotonic()
-                    self._save_checkpoint(episode + 1)
-                    saved = time.monotonic()
-                    pause = max(self.args.checkpoint_every, 50 * (saved - began))
-                if stopped:
-                    self.bar.write(f"Stopped after {episode + 1} episodes; go on with --resume.", file=sys.stderr)
-                    sys.exit(128 + stopped[0])
-        finally:
-            self.bar.close()
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-
-    def record(self, episode, rollout, **figures):
-        """Keep one episode of every trial; every `log_every` episodes write the means since the last time to TensorBoard."""
-        self.log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
-        for name, values in figures.items():
-            self.sums[name] += values
-        done, every = episode + 1, self.args.log_every
-        if done % every:
-            return
-        recent, seconds = slice(done - every, done), time.monotonic() - self.clock
-        curves = self.log.means(recent)
-        steps = curves["episodic_length"] * every
-        curves.update(SPS=steps / seconds, **{name: total / every for name, total in self.sums.items()})
-        for name, values in curves.items():
-            for writer, value in zip(self.writers, values, strict=True):
-                writer.add_scalar(f"charts/{name}", value, done)
-        for total in self.sums.values():
-            total[:] = 0
-        recently = {"reward/step": f"{curves['reward_per_step'].mean():.2f}", "steps/s": f"{steps.sum() / seconds:.0f}"}
-        if self.env.world.outcome_names:
-            recently["trials at best"] = f"{self.log.share_at_best(recent):.0%}"
-        self.bar.set_postfix(recently, refresh=False)
-        self.clock = time.monotonic()
-
-    def finish(self, policy):
-        """Write what was asked for and, last of all, the file that marks the run as finished."""
-        args, directory = self.args, self.args.run_dir
-        for writer in self.writers:
-            writer.close()
-        if args.save_model:
-            team = {"method": METHOD, "env": args.env, "env_args": list(args.env_args), "max_steps": self.env.world.max_steps}
-            with envs.complete_file(directory / "policy.pt") as file:
-                torch.save({**team, "hidden": list(args.hidden), "params": [p.detach() for p in policy.params]}, file)
-        if args.capture_video:
-            play(self.env, policy, args, 1, directory / "team.gif")
-        with envs.complete_file(self.result) as file:
-            np.savez(file, returns=self.log.returns, lengths=self.log.lengths, outcomes=self.log.outcomes)
-        self.checkpoint.unlink(missing_ok=True)
-        print(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {self.log.summary()}")
-
-
-def play(env, policy, args, num_episodes, video):
-    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
-    rng, rollout, frames = np.random.default_rng(args.seed), Rollout(env), []
-    log = envs.EpisodeLog(env.world, env.num_envs, num_episodes)
-    for episode in range(num_episodes):
-        uniforms = None if args.greedy else rng.random((env.num_envs, env.world.max_steps, env.world.num_agents))
-        collect(env, policy, uniforms, rollout, frames if episode == 0 else None)
-        log.add(episode, rollout.reward[: rollout.lengths.max()], rollout.lengths, rollout.outcomes)
-    try:
-        envs.save_gif(video, frames)
-    except OSError as error:
-        raise envs.UsageError(f"cannot write {video}: {error.strerror}.") from error
-    return log
-
-
-def load_teams(path):
-    """The worlds and the policies of a policy.pt that --save-model wrote; UsageError for anything else."""
-    if not path.exists():
-        raise envs.UsageError(f"there is no file {path}.")
-    try:
-        saved = torch.load(path, weights_only=True)
-        world = envs.make_world(saved["env"], **{"max_steps": saved["max_steps"], **envs.parse_options(saved["env_args"])})
-        teams = len(saved["params"][0]) // world.num_agents
-        sizes = [world.obs_dim, *saved["hidden"], world.num_actions]
-        policy = Policy([np.random.default_rng(0)] * teams, world.num_agents, sizes)
-        for param, kept in zip(policy.params, saved["params"], strict=True):
-            param.data.copy_(kept)
-    except Exception as error:  # whatever can be wrong with a file
-        raise envs.UsageError(f"{path} is not a policy.pt that --save-model wrote.") from error
-    return envs.GridVectorEnv(world, teams), policy
-
-
-def evaluate(args):
-    """Play the teams of a policy.pt that --save-model wrote, say how their episodes ended, and write a GIF beside it."""
-    torch.set_num_threads(1)
-    video, num_episodes = args.evaluate.with_suffix(".gif"), 100 if args.num_episodes is None else args.num_episodes
-    check_limits("num_episodes", num_episodes)
-    check_limits("seed", args.seed)
-    env, policy = load_teams(args.evaluate)
-    log = play(env, policy, args, num_episodes, video)
-    print(f"{args.evaluate}: {num_episodes} episodes of {env.num_envs} teams, {log.summary(share=1.0)}; one of them in {video}")
-
-
-def main():
-    try:
-        args = tyro.cli(Args, description=__doc__)
-        evaluate(args) if args.evaluate else train(args)
-    except envs.UsageError as error:
-        print(f"{METHOD}.py: {error}", file=sys.stderr)
-        sys.exit(2)
+        mean_bonus = bonus.sum((0, 2)) / (rollout.lengths * bonus.shape[2])
+        figures = dict(bonus=mean_bonus, inverse_loss=inverse_loss, inverse_accuracy=inverse_accuracy)
+        run.record(episode, rollout, policy_loss=loss, **figures)
+    return run.finish()
 
 
 if __name__ == "__main__":
-    main()
+    main(Args, build, train)

@@ -24,7 +24,7 @@ def find_cache():
         numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="envs-")
         atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
         print(
-            "Compiled code cannot be kept here, so every start compiles anew; NUMBA_CACHE_DIR names a place.", file=sys.stderr
+            "Compiled code cannot be kept here, so each start compiles anew; NUMBA_CACHE_DIR names a place.", file=sys.stderr
         )
 
 
