@@ -1,6 +1,6 @@
 """AC: decentralised actors with one centralised critic (Williams, 1992; Sutton & Barto, Section 13.5), on the base of pg.py.
 
-While the team learns, a critic V sees the joint observation s_t of all agents. After each episode of T steps
+While the team learns, a critic V sees s_t, which is the global state and the joint observation. After each episode of T steps
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)                    is the critic's one-step error, the same for all agents,
     g_i = 1/T sum_t delta_t grad log pi_i(a_t | o_t)             is the direction along which every actor i climbs, and
@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from envs import Rollout
+from envs import Rollout, distinct_rows, in_every_step
 from envs.run import AtLeast, Between, Run, RunArgs, generators_of, main, resolve
 
 # Table 1 of the paper.
@@ -101,6 +101,15 @@ def update(optimizer, kind, loss):
     optimizer.step()
 
 
+def critic_inputs(rollout):
+    """What the critic sees of every step, and after the last: the global state and the joint observation.
+
+    -> [T + 1, num_trials, 1, state_dim + num_agents * obs_dim]
+    """
+    joint_obs = rollout.all_obs.reshape(*rollout.all_obs.shape[:2], -1)
+    return np.concatenate([rollout.global_state, joint_obs], axis=2)[:, :, None]
+
+
 def td_errors(reward, values, lengths, terminated, gamma):
     """delta_t = r_t + gamma V(s_{t+1}) - V(s_t) of every step, 0 beyond an episode's end.
 
@@ -117,7 +126,7 @@ def build(args, world, init):
     """All that learns or remembers, for all trials; `init` are the generators of the first weights."""
     return SimpleNamespace(
         policy=StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions]),
-        critic=StackedMLP(init, 1, [world.num_agents * world.obs_dim, *args.hidden, 1]),
+        critic=StackedMLP(init, 1, [len(world.start) + world.num_agents * world.obs_dim, *args.hidden, 1]),
     )
 
 
@@ -135,8 +144,8 @@ def train(args: Args):
         rollout.play(team.policy.params, act)
 
         # The critic's values and errors, before it learns from this episode.
-        joint_obs = torch.from_numpy(rollout.all_obs).flatten(2)  # [T + 1, num_trials, num_agents * obs_dim]
-        values = team.critic(joint_obs.transpose(0, 1))[:, :, 0].T  # [T + 1, num_trials]
+        inputs, rows = distinct_rows(critic_inputs(rollout), rollout.lengths + 1)
+        values = in_every_step(team.critic(inputs), rows)[:, :, 0, 0]  # [T + 1, num_trials]
         detached = values.detach().double().numpy()
         delta = td_errors(rollout.reward[:, :, 0] / REWARD_SCALE, detached, rollout.lengths, rollout.terminated, args.gamma)
 
