@@ -63,7 +63,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the critic, which always has a persistent Adam (None: tuned for world and optimiser; 0.003 in others)"""
+    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
 
 
 class StackedMLP:

@@ -53,7 +53,7 @@ TUNED = {
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=1e-3)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critic learns from rewards divided by this, so from 0.3 to 10; its curves are in units of reward
 
 
@@ -68,7 +68,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the critic, which always has a persistent Adam (None: tuned for world and optimiser; 0.001 in others)"""
+    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     truncation: Annotated[float, AtLeast(1)] = 10.0
     """largest importance ratio of an action taken; a term for all actions makes up for the rest (c of Eq. 9)"""
     trust_region: Annotated[float, AtLeast(0)] = 1.0

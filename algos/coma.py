@@ -69,7 +69,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in others)"""
+    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     td_lambda: Annotated[float, Between(0, 1)] = 0.8
     """lambda of the critics' targets: 0 looks one step ahead, 1 to the end of the episode (Foerster et al.)"""
     target_critic_every: Annotated[int, AtLeast(1)] = 200

@@ -57,7 +57,7 @@ TUNED = {
     ("pushbox", "sign"): dict(learning_rate=3e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, beta=1.0, slots=10),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.01, slots=10)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.1, slots=10)  # what a world of your own gets
 # Widths of the discriminators' hidden layers and of a code (published: 32 and 16 in doom.py, 16 and 8 in pointmass.py).
 HIDDEN, CODE = 32, 8
 
@@ -73,7 +73,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
-    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.01 in other worlds)"""
+    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
     exemplar_learning_rate: Annotated[float, AtLeast(0)] = 1e-2
     """step size of the discriminators, which always have a persistent Adam (1e-4 in the published code, which fits more)"""
     kl_weight: Annotated[float, AtLeast(0)] = 0.001

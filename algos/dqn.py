@@ -12,6 +12,8 @@ Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), does 
 The time limit bootstraps, the end of the world does not. The copies Q' are timed by steps, because episodes become ten times as
 short: with one every 200 episodes, teams in findtreasure often fell back into walking in circles.
 
+All scores are of play with epsilon, 0.05 in the end; that of greedy play is what `--evaluate policy.pt --greedy` says.
+
     python algos/dqn.py --env findtreasure --num-trials 20
 """
 
@@ -59,7 +61,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the networks, which always have a persistent Adam (None: tuned for the world; 0.001 in other worlds)"""
+    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     exploration: Annotated[float | None, Between(1e-3, 1)] = None
     """share of the episodes over which epsilon falls linearly from 1 to 0.05 (None: tuned for the world; 0.2 in others)"""
     buffer_size: Annotated[int, AtLeast(1)] = 20_000

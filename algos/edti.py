@@ -69,7 +69,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in others)"""
+    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     eta: Annotated[float | None, AtLeast(0)] = None
     """weight of the novelty u, in thousandths of the world's largest reward (None: tuned for world and optimiser, else 10)"""
     beta_ext: Annotated[float, AtLeast(0)] = 0.1

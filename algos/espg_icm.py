@@ -52,7 +52,7 @@ TUNED = {
     ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, beta=1.0, slots=10),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.3, slots=10)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.1, slots=10)  # what a world of your own gets
 
 
 @dataclass
@@ -66,7 +66,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
-    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.3 in other worlds)"""
+    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
     icm_learning_rate: Annotated[float, AtLeast(0)] = 1e-3
     """step size of the curiosity module, which always has a persistent Adam"""
     forward_weight: Annotated[float, Between(0, 1)] = 0.2

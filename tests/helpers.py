@@ -1,9 +1,12 @@
 """What several tests share: recorded episodes, agents placed by hand, random play; runs of the scripts and plain gradients."""
 
-import copy
+import contextlib
 import importlib
+import io
 import itertools
 import json
+import subprocess
+import sys
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,11 +20,15 @@ from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import envs
+from envs import run
+from envs.run import arrays_of
 
 settings.register_profile("compiled", deadline=None)  # the first example of a test may compile a world's rules
 settings.load_profile("compiled")
 ALGOS = Path(__file__).resolve().parents[1] / "algos"
-SCRIPTS = sorted(path.stem for path in ALGOS.glob("*.py"))
+# The repository's own scripts, not those that a user has put beside them; without git, all that are there.
+LISTED = subprocess.run(["git", "-C", str(ALGOS), "ls-files", "*.py"], capture_output=True, text=True).stdout.split()
+SCRIPTS = sorted(path.stem for path in ([ALGOS / name for name in LISTED] or ALGOS.glob("*.py")))
 each_script = pytest.mark.parametrize("name", SCRIPTS)
 each_setting = pytest.mark.parametrize(
     ("env", "optimizer"), list(itertools.product(("findtreasure", "pushbox"), ("sign", "adam")))
@@ -155,26 +162,41 @@ def weights(policy):
 class Update(NamedTuple):
     """One update of the policies: the episode before it, the weights then, and the direction in which they are to climb."""
 
-    rollout: object
+    rollout: SimpleNamespace
     params: list
     direction: list
 
 
+ROLLOUT = ("obs", "rows", "all_obs", "actions", "reward", "lengths", "outcomes", "terminated", "played", "entropy")
+ROLLOUT += ("states", "global_state", "local_state")
+
+
+def record_rollouts(module, monkeypatch):
+    """A list that gets a copy of every rollout that the script plays from now on, and the `params` that played it."""
+    rollouts = []
+
+    class WatchedRollout(module.Rollout):
+        def play(self, params, *args):
+            super().play(params, *args)
+            rollouts.append(SimpleNamespace(params=params, **{name: getattr(self, name).copy() for name in ROLLOUT}))
+
+    monkeypatch.setattr(module, "Rollout", WatchedRollout)
+    return rollouts
+
+
 def record_updates(module, monkeypatch):
-    """A list that gets every `Update` that the script makes from now on."""
-    updates, rollouts, collect = [], [], module.collect
+    """A list that gets every `Update` of the policies, which are those that play, that the script makes from now on."""
+    updates, update = [], module.update
+    rollouts = record_rollouts(module, monkeypatch)
 
-    def watched_collect(env, policy, uniforms, rollout, frames=None):
-        collect(env, policy, uniforms, rollout, frames)
-        rollouts.append(copy.deepcopy(rollout))
+    def watched_update(optimizer, kind, loss):
+        rollout = rollouts[-1]
+        if optimizer.param_groups[0]["params"][0] is rollout.params[0]:
+            grads = torch.autograd.grad(loss, rollout.params, retain_graph=True)
+            updates.append(Update(rollout, weights(rollout), [-grad for grad in grads]))
+        update(optimizer, kind, loss)
 
-    class WatchedOptimizer(module.StackedOptimizer):
-        def step(self, grads, active=None):
-            updates.append(Update(rollouts[-1], weights(self), [-grad.clone() for grad in grads]))
-            super().step(grads, active)
-
-    monkeypatch.setattr(module, "collect", watched_collect)
-    monkeypatch.setattr(module, "StackedOptimizer", WatchedOptimizer)
+    monkeypatch.setattr(module, "update", watched_update)
     return updates
 
 
@@ -249,7 +271,7 @@ def use_double_precision(module, monkeypatch):
         self.params = [param.detach().double().requires_grad_() for param in self.params]
 
     monkeypatch.setattr(network, "__init__", init_in_double)
-    monkeypatch.setattr(network, "__call__", lambda self, x: call(self, x.double()))
+    monkeypatch.setattr(network, "__call__", lambda self, x: call(self, torch.as_tensor(x).double()))
 
 
 def assert_same_episodes(some, others):
@@ -271,11 +293,12 @@ def assert_trials_are_runs(module, directory, tolerance, **args):
             assert float((one - all_trials.chunk(3)[k]).abs().max()) <= tolerance
 
 
-def assert_same_run(one, other):
-    """Two runs are the same bit for bit."""
+def assert_same_run(one, other, parts=("policy",)):
+    """Two runs are the same bit for bit: their episodes, and the parts of their teams."""
     for name in ("returns", "lengths", "outcomes"):
         assert np.array_equal(getattr(one.log, name), getattr(other.log, name))
-    assert all(map(torch.equal, weights(one.policy), weights(other.policy)))
+    for part in parts:
+        assert all(map(torch.equal, arrays_of(getattr(one, part)), arrays_of(getattr(other, part))))
 
 
 def curves(directory):
@@ -283,3 +306,56 @@ def curves(directory):
     events = EventAccumulator(str(directory), size_guidance={"scalars": 0})
     events.Reload()
     return {tag: [(point.step, point.value) for point in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+def command(name, *words):
+    """Run a script in this process, as the command line would."""
+    out, err, code, argv, module = io.StringIO(), io.StringIO(), 0, sys.argv, script(name)
+    sys.argv = [f"algos/{name}.py", *map(str, words)]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            run.main(module.Args, module.build, module.train)
+    except SystemExit as error:
+        code = error.code or 0
+    finally:
+        sys.argv = argv
+    return Ended(code, out.getvalue(), err.getvalue())
+
+
+def assert_refusal(name, ended, *said):
+    """The command ended with code 2 and one sentence."""
+    assert (ended.code, ended.out) == (2, ""), ended
+    sentence = ended.err.splitlines()[-1]
+    assert sentence.startswith(f"{name}.py: ")
+    assert_one_sentence(sentence)
+    for words in said:
+        assert words in sentence
+
+
+def results(directory):
+    """The arrays of episodes.npz."""
+    with np.load(directory / "episodes.npz") as file:
+        return dict(file)
+
+
+def assert_same_results(directory, other):
+    """Two runs have left the same episodes."""
+    found, expected = results(directory), results(other)
+    assert found.keys() == expected.keys() == {"returns", "lengths", "outcomes"}
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert np.array_equal(found[name], values)
+
+
+def contents(directory):
+    """Everything that lies in a directory but for what says who owns it: {path: bytes}, None for a directory."""
+    found = [path for path in directory.rglob("*") if path.name != ".owner"]
+    return {path.relative_to(directory): path.read_bytes() if path.is_file() else None for path in found}
