@@ -1,18 +1,24 @@
 """AC: its errors against closed forms, every update of actors and critic against plain loops, and learning."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
+import envs
 from algos import ac, pg
 from tests.helpers import (
+    Update,
     assert_same_direction,
     assert_same_run,
     curves,
     each_setting,
+    look,
     plain_logits,
     record_updates,
     train,
+    weights,
 )
 
 CLIMB = np.array([[11.0, -30.0, 0.0], [-30.0, 7.0, 6.0], [0.0, 0.0, 5.0]])  # the team's reward for both actions
@@ -25,6 +31,47 @@ def plain_errors(reward, values, terminated, gamma):
         target = reward[t] if terminated and t == len(reward) - 1 else reward[t] + gamma * values[t + 1]
         errors.append(target - values[t])
     return errors
+
+
+def plain_input(world, state, obs):
+    """What the critic sees in one step: the integers `state` [state_dim], scaled, and obs [num_agents, obs_dim]."""
+    return np.concatenate([state * world.state_scale, *obs]).astype(np.float32)
+
+
+def record_both(monkeypatch):
+    """Lists that get every `Update` of the actors, and every one of the critic, which follows it."""
+    actors, critics = record_updates(ac, monkeypatch), []
+    watched = ac.update
+
+    def update(optimizer, kind, loss):
+        params, before = optimizer.param_groups[0]["params"], len(actors)
+        known = weights(SimpleNamespace(params=params))
+        grads = torch.autograd.grad(loss, params, retain_graph=True)
+        watched(optimizer, kind, loss)
+        if len(actors) == before:
+            critics.append(Update(actors[-1].rollout, known, [-grad for grad in grads]))
+
+    monkeypatch.setattr(ac, "update", update)
+    return actors, critics
+
+
+# --- what the critic sees ---
+
+
+def test_the_critic_tells_states_apart_that_look_the_same_to_all_agents():
+    """In pushbox both agents face an empty cell wherever the first one stands."""
+    world = envs.make_world("pushbox")
+    states = np.array([[0, 0, 1, 3, 0, 3, 2, 2, 2], [0, 1, 1, 3, 0, 3, 2, 2, 2]])
+    obs = np.array([look(world, state) for state in states], np.float32)
+    assert np.array_equal(*obs)
+    rollout = SimpleNamespace(all_obs=obs[:, None], global_state=(states * world.state_scale).astype(np.float32)[:, None])
+    inputs = ac.critic_inputs(rollout)
+    assert (inputs.shape, inputs.dtype) == ((2, 1, 1, 19), np.float32)
+    for found, state, seen in zip(inputs[:, 0, 0], states, obs, strict=True):
+        assert np.array_equal(found, plain_input(world, state, seen))
+    critic = ac.build(ac.Args(hidden=(64, 32)), world, [np.random.default_rng(0)]).critic
+    first, second = critic(inputs[:, 0, 0][None]).flatten().tolist()
+    assert abs(first - second) > 1e-3
 
 
 # --- the errors ---
@@ -88,27 +135,30 @@ def test_the_expected_gradient_of_the_climb_game_is_its_closed_form_for_any_valu
 
 
 def play_a_loop(monkeypatch, *, terminated):
-    """Episodes of 5 steps with one observation and reward 1, which then are cut or, in trials that are `terminated`, end."""
+    """Episodes of 5 steps in one state and reward 1, which then are cut or, in trials that are `terminated`, end."""
 
-    def loop(env, policy, uniforms, rollout, frames=None):
-        rollout.obs[:] = 0.5
-        rollout.actions[:], rollout.reward[:], rollout.lengths[:] = 0, 1.0, 5
-        rollout.outcomes[:] = terminated
+    class Loop(ac.Rollout):
+        def play(self, params, generators):
+            self._all_obs[:], self._obs[:, 0] = 0.5, 0.5
+            self._states[:], self._rows[:], self._actions[:], self._reward[:] = 1, 0, 0, 1.0
+            self.lengths[:], self.outcomes[:] = 5, terminated
+            self._show(self._obs[:, :1])
 
-    monkeypatch.setattr(ac, "collect", loop)
+    monkeypatch.setattr(ac, "Rollout", Loop)
 
 
 def test_the_critic_of_a_loop_learns_that_the_time_limit_ends_nothing(tmp_path, monkeypatch):
     play_a_loop(monkeypatch, terminated=[False, True])
     args = dict(num_trials=2, num_episodes=500, max_steps=5, gamma=0.9, critic_learning_rate=1e-2, log_every=100)
-    critic = train(ac, tmp_path, **args).critic
-    values = 10 * critic(torch.full((2, 1, 10), 0.5)).detach().flatten().numpy()
+    trained = train(ac, tmp_path, **args)
+    seen = plain_input(trained.log.world, np.ones(9), np.full((2, 5), 0.5))
+    values = 10 * trained.critic(np.tile(seen, (2, 1, 1))).detach().flatten().numpy()
     # V = 1 + 0.9 V where the time limit cuts; V = 1 + 0.9 V in four of five steps, 1 in the fifth, where the world ends
     assert values == pytest.approx([10, 1 / (1 - 0.9 * 4 / 5)], abs=0.01)
     for k, (value, error) in enumerate([(10, 0), (1 / 0.28, 0.4 * 0.9 / 0.28)]):
         shown = curves(tmp_path / f"seed{1 + k}")
-        assert shown["charts/value"][-1] == (500, pytest.approx(value, abs=0.02))
-        assert shown["charts/td_error"][-1] == (500, pytest.approx(error, abs=0.02))
+        assert shown["charts/value"][-1] == (2500, pytest.approx(value, abs=0.02))
+        assert shown["charts/td_error"][-1] == (2500, pytest.approx(error, abs=0.02))
 
 
 @pytest.mark.parametrize(("terminated", "expected"), [(True, 4.0951), (False, 10.0)])
@@ -132,30 +182,29 @@ def critic_descent(params, k, states, targets):
 
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
 def test_every_update_of_actors_and_critic(env, tmp_path, monkeypatch):
-    updates = record_updates(ac, monkeypatch)
+    actors, critics = record_both(monkeypatch)
     args = dict(env=env, seed=1, num_trials=3, num_episodes=12, max_steps=15, learning_rate=0.05, gamma=0.9)
-    train(ac, tmp_path, **args, critic_learning_rate=0.1, log_every=1)
-    assert len(updates) == 24
+    log = train(ac, tmp_path, **args, critic_learning_rate=0.1, log_every=1).log
+    assert len(actors) == len(critics) == 12
     shown = [curves(tmp_path / f"seed{1 + k}") for k in range(3)]
     ends = set()
-    for n, (actors, critic) in enumerate(zip(updates[::2], updates[1::2], strict=True)):
-        rollout, steps_of = actors.rollout, []
+    for n, (actor, critic) in enumerate(zip(actors, critics, strict=True)):
+        rollout, steps_of = actor.rollout, []
         for k, length in enumerate(rollout.lengths):
             ends.add((length < rollout.lengths.max(), rollout.outcomes[k] > 0))
-            states = [np.concatenate(list(agents)) for agents in rollout.obs[: length + 1, k]]
+            obs, actions = rollout.all_obs[: length + 1, k], rollout.actions[:length, k]
+            seen = [plain_input(log.world, *step) for step in zip(rollout.states[: length + 1, k], obs, strict=True)]
             own = [param[k].double() for param in critic.params]
-            values = [float(plain_logits(own, s)[0]) for s in states]
-            errors = np.array(plain_errors(rollout.reward[:length, k] / 10, values, rollout.outcomes[k] > 0, 0.9))
-            for i in range(2):
-                steps_of.append(
-                    list(zip(rollout.obs[:length, k, i], rollout.actions[:length, k, i], errors / length, strict=True))
-                )
-            expected = critic_descent(critic.params, k, states[:-1], errors + values[:-1])
+            values = [float(plain_logits(own, x)[0]) for x in seen]
+            errors = np.array(plain_errors(rollout.reward[:length, k, 0] / 10, values, rollout.outcomes[k] > 0, 0.9))
+            steps_of += [list(zip(obs[:length, i], actions[:, i], errors / length, strict=True)) for i in range(2)]
+            expected = critic_descent(critic.params, k, seen[:-1], errors + values[:-1])
             for found, plain in zip(critic.direction, expected, strict=True):
                 assert np.allclose(found[k], plain, rtol=1e-4, atol=1e-5 * max(1.0, float(plain.abs().max())))
+            steps = log.lengths[k, : n + 1].sum()
             for tag, value in {"value": np.mean(values[:-1]), "td_error": np.sqrt(np.mean(errors**2))}.items():
-                assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(10 * value, rel=1e-4, abs=1e-5))
-        assert_same_direction(actors.direction, actors.params, steps_of)
+                assert shown[k][f"charts/{tag}"][n] == (steps, pytest.approx(10 * value, rel=1e-4, abs=1e-5))
+        assert_same_direction(actor.direction, actor.params, steps_of)
     assert (False, False) in ends
     if env == "pushbox":
         assert (True, True) in ends
@@ -163,13 +212,13 @@ def test_every_update_of_actors_and_critic(env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_critic_has_an_adam_of_its_own(optimizer, tmp_path, monkeypatch):
-    updates = record_updates(ac, monkeypatch)
+    _, critics = record_both(monkeypatch)
     args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10)
     trained = train(ac, tmp_path, **args, learning_rate=1e-3, critic_learning_rate=1e-2)
-    reference = [param.clone() for param in updates[1].params]
+    reference = [param.clone() for param in critics[0].params]
     adam = torch.optim.Adam(reference, lr=1e-2)
-    after = [*(update.params for update in updates[3::2]), trained.critic.params]
-    for update, following in zip(updates[1::2], after, strict=True):
+    after = [*(update.params for update in critics[1:]), trained.critic.params]
+    for update, following in zip(critics, after, strict=True):
         for param, direction in zip(reference, update.direction, strict=True):
             param.grad = -direction
         adam.step()
@@ -180,18 +229,21 @@ def test_a_critic_has_the_hidden_layers_of_table_1_and_weights_drawn_after_the_a
     critic = train(ac, tmp_path, env="pushbox", seed=4, num_trials=2, num_episodes=1, critic_learning_rate=0.0).critic
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (4, 5)]
     ac.StackedMLP(fresh, 2, [5, 64, 32, 4])
-    expected = ac.StackedMLP(fresh, 1, [10, 64, 32, 1])
+    expected = ac.StackedMLP(fresh, 1, [9 + 10, 64, 32, 1])
     assert all(map(torch.equal, critic.params, expected.params))
 
 
 @each_setting
 def test_without_values_it_is_pg_of_the_reward_alone_bit_for_bit(env, optimizer, tmp_path, monkeypatch):
-    class Nothing(ac.StackedMLP):
-        def __init__(self, *args):
-            super().__init__(*args)
-            self.params = [torch.zeros_like(param).requires_grad_() for param in self.params]
+    build = ac.build
 
-    monkeypatch.setattr(ac, "StackedMLP", Nothing)
+    def build_without_values(*args):
+        team = build(*args)
+        for param in team.critic.params:
+            param.data.zero_()
+        return team
+
+    monkeypatch.setattr(ac, "build", build_without_values)
     monkeypatch.setattr(ac, "REWARD_SCALE", 1.0)
     args = dict(env=env, optimizer=optimizer, seed=5, num_trials=2, num_episodes=60, learning_rate=1e-3)
     plain = train(pg, tmp_path / "pg", **args, gamma=0.0)

@@ -8,15 +8,7 @@ import torch
 
 import envs
 from algos import acer
-from tests.helpers import (
-    assert_same_direction,
-    curves,
-    each_setting,
-    plain_logits,
-    record_updates,
-    train,
-    weights,
-)
+from tests.helpers import Update, assert_same_direction, curves, each_setting, plain_logits, record_rollouts, train, weights
 
 
 def random_policy(rng, num_actions=4):
@@ -228,14 +220,14 @@ def test_the_networks_see_every_observation_once():
     obs[30, 2] = obs[4, 2]  # what comes after the last step has been seen before
     for k, length in enumerate(lengths):
         obs[length + 1 :, k] = np.nan
-    distinct, rows = acer.distinct_observations(obs, lengths)
+    distinct, rows = acer.distinct_rows(obs, lengths + 1)
     assert distinct.shape == (6, 30, 5)
     for k, length in enumerate(lengths):
         for i in range(2):
-            seen, net = obs[: length + 1, k, i], 2 * k + i
-            assert np.array_equal(distinct[net, rows[: length + 1, k, i]], seen)
-            assert rows[: length + 1, k, i].max() + 1 == len({place.tobytes() for place in seen})
-            assert not distinct[net, rows[: length + 1, k, i].max() + 1 :].any()
+            seen, own, net = obs[: length + 1, k, i], rows[: length + 1, k, i], 2 * k + i
+            assert np.array_equal(distinct[net, own], seen)
+            assert own.max() + 1 == len({place.tobytes() for place in seen})
+            assert not distinct[net, own.max() + 1 :].any()
 
 
 def test_probabilities_are_never_nought():
@@ -251,14 +243,22 @@ def test_probabilities_are_never_nought():
 MAX_STEPS = 12
 
 
-def played(rng, lengths):
-    """A random episode of every trial as a rollout, with the probabilities of its actions."""
-    trials = len(lengths)
-    lengths, outcomes = np.array(lengths), rng.integers(3, size=trials)
-    obs = rng.normal(size=(MAX_STEPS + 1, trials, 2, 5)).astype(np.float32)
-    actions, reward = rng.integers(4, size=(MAX_STEPS, trials, 2)), rng.normal(size=(MAX_STEPS, trials))
-    mu = rng.random((max(lengths) + 1, trials, 2, 4)).astype(np.float32)
-    return SimpleNamespace(obs=obs, actions=actions, reward=reward, mu=mu, lengths=lengths, outcomes=outcomes)
+def random_rollout(rng, lengths):
+    """A random episode of every trial as a rollout, and the probabilities of its actions."""
+    longest, trials = max(lengths), len(lengths)
+    rollout = SimpleNamespace(
+        all_obs=rng.normal(size=(longest + 1, trials, 2, 5)).astype(np.float32),
+        actions=rng.integers(4, size=(longest, trials, 2)),
+        reward=rng.normal(size=(longest, trials, 1)).repeat(2, axis=2),
+        lengths=np.array(lengths),
+        outcomes=rng.integers(3, size=trials),
+        played=np.arange(longest)[:, None] < lengths,
+    )
+    return rollout, rng.random((longest, trials, 2, 4)).astype(np.float32)
+
+
+def empty_replay(trials, num_episodes, size):
+    return acer.EpisodeReplay(envs.make_world("pushbox", max_steps=MAX_STEPS), trials, num_episodes, size)
 
 
 def kept_of(lengths, size):
@@ -275,12 +275,11 @@ def kept_of(lengths, size):
 @pytest.mark.parametrize("size", [1, 40, 1000])
 def test_the_replay_keeps_the_last_whole_episodes(size):
     rng, trials, num_episodes = np.random.default_rng(size), 3, 60
-    replay = acer.EpisodeReplay(envs.make_vec("pushbox", trials, max_steps=MAX_STEPS), num_episodes, size)
-    episodes, forgotten = [], 0
+    replay, episodes, forgotten = empty_replay(trials, num_episodes, size), [], 0
     for episode in range(num_episodes):
-        episodes.append(played(rng, rng.integers(1, MAX_STEPS + 1, trials)))
-        replay.add(episode, episodes[-1])
-        kept = [kept_of([one.lengths[k] for one in episodes], max(size, MAX_STEPS + 1)) for k in range(trials)]
+        episodes.append(random_rollout(rng, rng.integers(1, MAX_STEPS + 1, trials)))
+        replay.add(episode, *episodes[-1])
+        kept = [kept_of([one.lengths[k] for one, _ in episodes], max(size, MAX_STEPS + 1)) for k in range(trials)]
         drawn = [replay.draw(episode, [np.random.default_rng([seed, k]) for k in range(trials)]) for seed in range(20)]
         for k in range(trials):
             fresh = [np.random.default_rng([seed, k]).integers(kept[k][0], episode + 1) for seed in range(20)]
@@ -289,25 +288,39 @@ def test_the_replay_keeps_the_last_whole_episodes(size):
         for chosen in ([one[0] for one in kept], [one[-1] for one in kept], [rng.choice(one) for one in kept]):
             found = replay.read(np.array(chosen))
             for k, number in enumerate(chosen):
-                expected, length = episodes[number], episodes[number].lengths[k]
-                assert (found.lengths[k], found.outcomes[k]) == (length, expected.outcomes[k])
-                assert np.array_equal(found.obs[: length + 1, k], expected.obs[: length + 1, k])
-                for name in ("actions", "mu", "reward"):
-                    assert np.array_equal(getattr(found, name)[:length, k], getattr(expected, name)[:length, k])
+                (rollout, mu), length = episodes[number], episodes[number][0].lengths[k]
+                assert (found.lengths[k], found.outcomes[k]) == (length, rollout.outcomes[k])
+                assert np.array_equal(found.obs[: length + 1, k], rollout.all_obs[: length + 1, k])
+                steps = rollout.actions, mu, rollout.reward[:, :, 0]
+                for name, expected in zip(("actions", "mu", "reward"), steps, strict=True):
+                    assert np.array_equal(getattr(found, name)[:length, k], expected[:length, k])
     assert (forgotten > 1000) == (size < 1000)
 
 
 def test_every_kept_episode_is_drawn_equally_often():
-    replay = acer.EpisodeReplay(envs.make_vec("pushbox", 1, max_steps=MAX_STEPS), 9, 30)
-    rng, lengths = np.random.default_rng(0), [12, 12, 3, 1, 12, 5]
-    for episode, length in enumerate(lengths):
-        replay.add(episode, played(rng, [length]))
+    replay, rng = empty_replay(1, 9, 30), np.random.default_rng(0)
+    for episode, length in enumerate([12, 12, 3, 1, 12, 5]):
+        replay.add(episode, *random_rollout(rng, [length]))
     draws = np.array([replay.draw(5, [rng])[0] for _ in range(8000)])
     assert np.bincount(draws, minlength=6)[2:] == pytest.approx(4 * [2000], rel=0.1)
     assert draws.min() == 2  # 4 + 2 + 13 + 6 rows are 25, and the second episode would take 13 more
 
 
 # --- whole runs ---
+
+
+def record_all_updates(monkeypatch):
+    """A list that gets every update that the script makes from now on, of the policies and of the critics in turn."""
+    updates, update, rollouts = [], acer.update, record_rollouts(acer, monkeypatch)
+
+    def watched_update(optimizer, kind, loss):
+        params = optimizer.param_groups[0]["params"]
+        grads = torch.autograd.grad(loss, params, retain_graph=True)
+        updates.append(Update(rollouts[-1], [param.detach().clone() for param in params], [-grad for grad in grads]))
+        update(optimizer, kind, loss)
+
+    monkeypatch.setattr(acer, "update", watched_update)
+    return updates
 
 
 def plain_update(steps, cut, params, q_params, average, net, numbers):
@@ -341,16 +354,13 @@ def plain_update(steps, cut, params, q_params, average, net, numbers):
 @each_setting
 def test_every_update_is_that_of_the_equations(env, optimizer, tmp_path, monkeypatch):
     """12 episodes of the script, two updates after each, against equations 5 and 9-12 written out for one step at a time."""
-    updates = record_updates(acer, monkeypatch)
+    updates = record_all_updates(monkeypatch)
     seed, trials, num_episodes, size, decay, rates = 6, 2, 12, 40, 0.7, (0.02, 0.01)
     numbers = gamma, truncation, delta, entropy = 0.9, 1.1, 0.3, 0.03
     result = train(
-        acer,
-        tmp_path,
-        **dict(
-            env=env, optimizer=optimizer, seed=seed, num_trials=trials, num_episodes=num_episodes, max_steps=10, log_every=1
-        ),
-        **dict(learning_rate=rates[0], critic_learning_rate=rates[1], gamma=gamma, truncation=truncation),
+        *(acer, tmp_path),
+        **dict(env=env, optimizer=optimizer, seed=seed, num_trials=trials, num_episodes=num_episodes, max_steps=10),
+        **dict(log_every=1, learning_rate=rates[0], critic_learning_rate=rates[1], gamma=gamma, truncation=truncation),
         **dict(trust_region=delta, entropy=entropy, average_decay=decay, buffer_size=size),
     )
     assert len(updates) == 4 * num_episodes
@@ -362,12 +372,12 @@ def test_every_update_is_that_of_the_equations(env, optimizer, tmp_path, monkeyp
         acting = [param.double() for param in updates[4 * episode].params]
         played.append([])
         for k, length in enumerate(rollout.lengths):
-            obs, actions = rollout.obs[: length + 1, k], rollout.actions[:length, k]
+            obs, actions = rollout.all_obs[: length + 1, k], rollout.actions[:length, k]
             mu = [
                 torch.stack([torch.softmax(plain_logits([p[2 * k + i] for p in acting], o), 0) for o in obs[:-1, i]]).numpy()
                 for i in range(2)
             ]
-            played[-1].append((obs, actions, mu, rollout.reward[:length, k], rollout.outcomes[k] == 0))
+            played[-1].append((obs, actions, mu, rollout.reward[:length, k, 0], rollout.outcomes[k] == 0))
             cuts.append(rollout.outcomes[k] == 0)
         kept = [kept_of([len(one[k][3]) for one in played], size) for k in range(trials)]
         old = [generator.integers(kept[k][0], episode + 1) for k, generator in enumerate(learn)]
@@ -397,7 +407,7 @@ def test_every_update_is_that_of_the_equations(env, optimizer, tmp_path, monkeyp
             after = updates[following].params if following < len(updates) else weights(result.policy)
             average = [decay * slow + (1 - decay) * fast.double() for slow, fast in zip(average, after, strict=True)]
         assert [shown[k]["charts/trust_region"][episode][1] for k in range(trials)] == pytest.approx(binding, abs=1e-6)
-    assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(average, result.average.params, strict=True))
+    assert all(np.allclose(a, b, atol=1e-5) for a, b in zip(average, weights(result.average), strict=True))
 
     # What these tests would not see if it did not happen.
     assert max(ages) > 1

@@ -3,19 +3,24 @@
 import itertools
 import os
 import signal
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
+import envs
 from algos import coma, pg
 from tests.helpers import (
+    Update,
     assert_same_direction,
     assert_same_run,
     curves,
+    look,
     plain_logits,
     record_updates,
     train,
+    weights,
 )
 
 CLIMB = np.array([[11.0, -30.0, 0.0], [-30.0, 7.0, 6.0], [0.0, 0.0, 5.0]])  # the team's reward for both actions
@@ -68,35 +73,53 @@ def test_the_expected_gradient_of_the_climb_game_is_its_closed_form(seed):
     assert np.abs(logits.grad.numpy() - closed_form).max() < 1e-12
 
 
-def plain_input(obs, actions, i, num_actions):
-    """What agent i's critic is asked in one step: obs [num_agents, obs_dim], actions [num_agents]."""
+# --- what the critics see ---
+
+
+def plain_input(scale, state, obs, actions, i, num_actions):
+    """What agent i's critic is asked in one step: state [state_dim], obs [num_agents, obs_dim], actions [num_agents]."""
     agents = len(actions)
     others = [(i + step) % agents for step in range(1, agents)]
-    return np.concatenate([*obs, *(np.eye(num_actions)[actions[j]] for j in others)])
+    one_hot = (np.eye(num_actions)[actions[j]] for j in others)
+    return np.concatenate([state * scale, *obs, *one_hot]).astype(np.float32)
 
 
 @pytest.mark.parametrize("agents", [1, 2, 3, 4])
-def test_a_critic_is_asked_with_all_observations_and_the_others_actions(agents):
+def test_a_critic_is_asked_with_the_state_all_observations_and_the_others_actions(agents):
     rng = np.random.default_rng(2)
     obs, actions = rng.random((6, 3, agents, 5), np.float32), rng.integers(4, size=(6, 3, agents))
-    inputs = coma.critic_inputs(obs, actions, 4)
-    assert (inputs.shape, inputs.dtype) == ((6, 3, agents, agents * 5 + (agents - 1) * 4), np.float32)
+    rollout = SimpleNamespace(all_obs=obs, global_state=rng.random((6, 3, 7), np.float32))
+    inputs = coma.critic_inputs(rollout, actions, 4)
+    assert (inputs.shape, inputs.dtype) == ((6, 3, agents, 7 + agents * 5 + (agents - 1) * 4), np.float32)
     for t, k, i in np.ndindex(6, 3, agents):
-        assert np.array_equal(inputs[t, k, i], plain_input(obs[t, k], actions[t, k], i, 4).astype(np.float32))
+        assert np.array_equal(inputs[t, k, i], plain_input(1, rollout.global_state[t, k], obs[t, k], actions[t, k], i, 4))
     for i in range(agents):
         changed = actions.copy()
         changed[:, :, i] = (actions[:, :, i] + 1) % 4
-        same = (coma.critic_inputs(obs, changed, 4) == inputs).all(3)
+        same = (coma.critic_inputs(rollout, changed, 4) == inputs).all(3)
         assert same[:, :, i].all()
         assert not np.delete(same, i, axis=2).any()
+
+
+def test_the_critics_tell_states_apart_that_look_the_same_to_all_agents():
+    """In pushbox both agents face an empty cell wherever the first one stands."""
+    world = envs.make_world("pushbox")
+    states = np.array([[0, 0, 1, 3, 0, 3, 2, 2, 2], [0, 1, 1, 3, 0, 3, 2, 2, 2]])
+    obs = np.array([look(world, state) for state in states], np.float32)
+    assert np.array_equal(*obs)
+    rollout = SimpleNamespace(all_obs=obs[:, None], global_state=(states * world.state_scale).astype(np.float32)[:, None])
+    inputs = coma.critic_inputs(rollout, np.zeros((2, 1, 2), int), 4)
+    critic = coma.build(coma.Args(hidden=(64, 32)), world, [np.random.default_rng(0)]).critic
+    first, second = critic(inputs[:, 0].transpose(1, 0, 2)).detach().unbind(1)  # [num_agents, num_actions]
+    assert float((first - second).abs().min()) > 1e-4
 
 
 def test_networks_see_every_input_once_and_answer_in_every_step():
     kinds, rng = np.random.default_rng(4).normal(size=(4, 3)).astype(np.float32), np.random.default_rng(5)
     inputs, lengths = kinds[rng.integers(4, size=(21, 3, 2))], np.array([20, 1, 9])
-    distinct, rows = coma.distinct_observations(inputs, lengths)
+    distinct, rows = envs.distinct_rows(inputs, lengths + 1)
     assert distinct.shape == (6, 4, 3)
-    answers = coma.in_every_step(torch.from_numpy(distinct), rows).numpy()
+    answers = envs.in_every_step(torch.from_numpy(distinct), rows).numpy()
     for k, length in enumerate(lengths):
         assert np.array_equal(answers[: length + 1, k], inputs[: length + 1, k])
 
@@ -166,16 +189,21 @@ def test_values_of_a_loop_that_see_the_time(terminated, expected, td_lambda):
 def test_the_critics_of_a_loop_learn_that_the_time_limit_ends_nothing(tmp_path, monkeypatch):
     """Episodes of 5 steps with one observation, any actions and reward 1: the first trial's are cut, the second's end."""
 
-    def loop(env, policy, uniforms, rollout, frames=None):
-        rollout.obs[:] = 0.5
-        rollout.actions[:] = (4 * uniforms.transpose(1, 0, 2)).astype(int)
-        rollout.reward[:], rollout.lengths[:], rollout.outcomes[:] = 1.0, 5, [0, 1]
+    class Loop(coma.Rollout):
+        def play(self, params, generators):
+            self._all_obs[:], self._obs[:, 0] = 0.5, 0.5
+            self._states[:], self._rows[:], self._reward[:] = 1, 0, 1.0
+            for k, generator in enumerate(generators):
+                self._actions[:, k] = generator.integers(4, size=(5, 2))
+            self.lengths[:], self.outcomes[:] = 5, [0, 1]
+            self._show(self._obs[:, :1])
 
-    monkeypatch.setattr(coma, "collect", loop)
+    monkeypatch.setattr(coma, "Rollout", Loop)
     args = dict(num_trials=2, num_episodes=1000, max_steps=5, hidden=(16,), gamma=0.9, learning_rate=0.0)
-    critic = train(coma, tmp_path, **args, critic_learning_rate=1e-2, target_critic_every=5).critic
-    inputs = torch.cat([torch.full((4, 10), 0.5), torch.eye(4)], dim=1).expand(4, 4, 14)
-    values = 10 * critic(inputs).detach().view(2, -1).numpy()
+    trained = train(coma, tmp_path, **args, critic_learning_rate=1e-2, target_critic_every=5)
+    state, obs = np.ones(9), np.full((2, 5), 0.5)
+    seen = [plain_input(trained.log.world.state_scale, state, obs, (other, other), 0, 4) for other in range(4)]
+    values = 10 * trained.critic(np.tile(seen, (4, 1, 1))).detach().view(2, -1).numpy()
     fixed = 0.0
     for _ in range(500):  # of q = the mean of all targets in an episode that ends
         targets = [1.0]
@@ -209,37 +237,54 @@ def critic_descent(own, inputs, actions, targets):
     return [-grad for grad in torch.autograd.grad(loss, own)]
 
 
+def record_both(monkeypatch):
+    """Lists that get every `Update` of the actors, and every one of the critics, which follows it."""
+    actors, critics = record_updates(coma, monkeypatch), []
+    watched = coma.update
+
+    def update(optimizer, kind, loss):
+        params, before = optimizer.param_groups[0]["params"], len(actors)
+        known = weights(SimpleNamespace(params=params))
+        grads = torch.autograd.grad(loss, params, retain_graph=True)
+        watched(optimizer, kind, loss)
+        if len(actors) == before:
+            critics.append(Update(actors[-1].rollout, known, [-grad for grad in grads]))
+
+    monkeypatch.setattr(coma, "update", update)
+    return actors, critics
+
+
 @pytest.mark.parametrize("world", WORLDS)
 def test_every_update_of_actors_and_critics(world, tmp_path, monkeypatch):
     """12 updates against Eq. 4 and the recursion, one step at a time; the target critics are copied after 5 and 10."""
-    updates = record_updates(coma, monkeypatch)
+    all_actors, all_critics = record_both(monkeypatch)
     args, agents = WORLDS[world]
     args = dict(args, seed=1, num_trials=3, num_episodes=12, max_steps=15, learning_rate=0.05, gamma=0.9, log_every=1)
     log = train(coma, tmp_path, **args, critic_learning_rate=0.1, td_lambda=0.7, target_critic_every=5).log
-    assert len(updates) == 24
-    num_actions = log.world.num_actions
+    assert len(all_actors) == len(all_critics) == 12
+    num_actions, scale = log.world.num_actions, log.world.state_scale
     learn = [np.random.default_rng(np.random.SeedSequence(1 + k).spawn(3)[2]) for k in range(3)]
     shown = [curves(tmp_path / f"seed{1 + k}") for k in range(3)]
     ends = set()
-    for n, (actors, critics) in enumerate(zip(updates[::2], updates[1::2], strict=True)):
+    for n, (actors, critics) in enumerate(zip(all_actors, all_critics, strict=True)):
         rollout, steps_of = actors.rollout, []
-        old = updates[1::2][n - n % 5].params
+        old = all_critics[n - n % 5].params
         for k, length in enumerate(rollout.lengths):
             terminated = rollout.outcomes[k] > 0
             ends.add((length < rollout.lengths.max(), terminated))
             nets = range(agents * k, agents * (k + 1))
             parts = (actors.params, critics.params, old)
             policies, own, target = ([[param[net].double() for param in part] for net in nets] for part in parts)
-            obs, uniforms = rollout.obs[: length + 1, k], learn[k].random(agents)
+            states, obs, uniforms = rollout.states[: length + 1, k], rollout.all_obs[: length + 1, k], learn[k].random(agents)
             drawn = [plain_draw(policies[i], obs[length, i], uniforms[i]) for i in range(agents)]
             actions = np.array([*rollout.actions[:length, k], drawn])
             figures = []
             for i in range(agents):
-                inputs = [plain_input(o, a, i, num_actions) for o, a in zip(obs, actions, strict=True)]
+                inputs = [plain_input(scale, *step, i, num_actions) for step in zip(states, obs, actions, strict=True)]
                 target_values = [float(plain_logits(target[i], x)[a]) for x, a in zip(inputs, actions[:, i], strict=True)]
                 following, targets = 0.0 if terminated else target_values[length], np.zeros(length)
                 for t in reversed(range(length)):
-                    targets[t] = rollout.reward[t, k] / 10 + 0.9 * following
+                    targets[t] = rollout.reward[t, k, 0] / 10 + 0.9 * following
                     following = 0.3 * target_values[t] + 0.7 * targets[t]
                 values = np.array([plain_logits(own[i], x).numpy() for x in inputs[:length]])
                 probs = [torch.softmax(plain_logits(policies[i], o), 0).numpy() for o in obs[:length, i]]
@@ -251,8 +296,9 @@ def test_every_update_of_actors_and_critics(world, tmp_path, monkeypatch):
                     assert np.allclose(found[nets[i]], plain, rtol=1e-4, atol=1e-5 * max(1.0, float(plain.abs().max())))
                 figures.append((taken.mean(), np.mean((targets - taken) ** 2)))
             value, square = np.mean(figures, axis=0)
+            steps = log.lengths[k, : n + 1].sum()
             for tag, expected in {"value": value, "td_error": np.sqrt(square)}.items():
-                assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(10 * expected, rel=1e-4, abs=1e-5))
+                assert shown[k][f"charts/{tag}"][n] == (steps, pytest.approx(10 * expected, rel=1e-4, abs=1e-5))
         assert_same_direction(actors.direction, actors.params, steps_of)
     assert (False, False) in ends
     if world == "pushbox":
@@ -261,13 +307,13 @@ def test_every_update_of_actors_and_critics(world, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_critics_have_an_adam_of_their_own(optimizer, tmp_path, monkeypatch):
-    updates = record_updates(coma, monkeypatch)
+    _, critics = record_both(monkeypatch)
     args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10)
     trained = train(coma, tmp_path, **args, learning_rate=1e-3, critic_learning_rate=1e-2)
-    reference = [param.clone() for param in updates[1].params]
+    reference = [param.clone() for param in critics[0].params]
     adam = torch.optim.Adam(reference, lr=1e-2)
-    after = [*(update.params for update in updates[3::2]), trained.critic.params]
-    for update, following in zip(updates[1::2], after, strict=True):
+    after = [*(update.params for update in critics[1:]), trained.critic.params]
+    for update, following in zip(critics, after, strict=True):
         for param, direction in zip(reference, update.direction, strict=True):
             param.grad = -direction
         adam.step()
@@ -278,7 +324,7 @@ def test_critics_have_the_hidden_layers_of_table_1_and_weights_drawn_after_the_a
     args = dict(env="pushbox", seed=4, num_trials=2, num_episodes=1, learning_rate=0.0, critic_learning_rate=0.0)
     trained = train(coma, tmp_path, **args)
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (4, 5)]
-    for found, sizes in ((trained.policy, [5, 64, 32, 4]), (trained.critic, [14, 64, 32, 4])):
+    for found, sizes in ((trained.policy, [5, 64, 32, 4]), (trained.critic, [9 + 14, 64, 32, 4])):
         assert all(map(torch.equal, found.params, coma.StackedMLP(fresh, 2, sizes).params))
 
 
@@ -296,21 +342,21 @@ def test_a_run_that_was_stopped_goes_on_with_its_target_critics_and_draws(tmp_pa
     args = dict(env="findtreasure", num_trials=2, num_episodes=30, max_steps=20, learning_rate=1e-2, critic_learning_rate=1e-2)
     args |= dict(target_critic_every=7)
     whole = train(coma, tmp_path / "whole", **args)
-    collect, played = coma.collect, []
+    played = []
 
-    def interrupted(*args):
-        collect(*args)
-        played.append(None)
-        if len(played) == 18:
-            os.kill(os.getpid(), signal.SIGINT)
+    class Interrupted(coma.Rollout):
+        def play(self, *args):
+            super().play(*args)
+            played.append(None)
+            if len(played) == 18:
+                os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patched:
-        patched.setattr(coma, "collect", interrupted)
+        patched.setattr(coma, "Rollout", Interrupted)
         with pytest.raises(SystemExit):
             train(coma, tmp_path / "stopped", **args)
     resumed = train(coma, tmp_path / "stopped", **args, resume=True)
-    assert_same_run(whole, resumed)
-    assert all(map(torch.equal, whole.critic.params, resumed.critic.params))
+    assert_same_run(whole, resumed, parts=("policy", "critic", "target_critic"))
 
 
 def test_coma_learns_to_push_boxes(tmp_path):

@@ -6,102 +6,101 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from numba import njit
 
 import envs
 from algos import dqn
-from tests.helpers import curves, plain_logits, record_updates, train, use_double_precision
+from envs.rollout import draw_action
+from envs.run import load, play_teams
+from tests.helpers import Update, curves, plain_logits, record_rollouts, train, use_double_precision, weights
 from tests.test_pg import CLIMB, generators
 
 # --- acting ---
 
 
-class FixedValues(dqn.Policy):
-    """A policy with given action values [num_nets, 1, num_actions] of every observation."""
-
-    def __init__(self, values):
-        self.values = torch.as_tensor(np.array(values), dtype=torch.float32)
-
-    def q_values(self, obs):
-        return self.values
-
-
 def play_probabilities(values, epsilon):
-    policy = FixedValues(values)
-    policy.epsilon = epsilon
-    return torch.exp(policy(None)).numpy()
+    """Of one agent's actions, for what its network says."""
+    probs = np.full(len(values), np.nan)
+    envs.epsilon_greedy(np.array(values, np.float32), probs, epsilon)
+    return probs
 
 
 @pytest.mark.parametrize("epsilon", [1.0, 0.4, 0.05])
 def test_the_best_action_is_played_but_with_probability_epsilon_any(epsilon):
-    values = np.random.default_rng(0).normal(scale=10, size=(6, 1, 5))
-    expected = np.full(values.shape, epsilon / 5)
-    np.put_along_axis(expected, values.argmax(-1)[..., None], 1 - epsilon * 4 / 5, axis=-1)
-    assert np.abs(play_probabilities(values, epsilon) - expected).max() < 1e-6
+    for values in np.random.default_rng(0).normal(scale=10, size=(6, 5)):
+        expected = np.full(5, epsilon / 5)
+        expected[values.argmax()] = 1 - epsilon * 4 / 5
+        assert np.abs(play_probabilities(values, epsilon) - expected).max() < 1e-12
 
 
 def test_without_randomness_only_the_best_action_is_played():
-    with np.errstate(divide="ignore"):
-        assert play_probabilities([[[1, 3, 2]], [[-5, -6, -7]]], 0.0).tolist() == [[[0, 1, 0]], [[1, 0, 0]]]
+    assert play_probabilities([1, 3, 2], 0.0).tolist() == [0, 1, 0]
+    assert play_probabilities([-5, -6, -7], 0.0).tolist() == [1, 0, 0]
 
 
-def test_of_equally_good_actions_one_is_best():
-    for values in ([0, 0, 0], [1, 2, 2], [3, 3, -1]):
-        probabilities = play_probabilities([[values]], 0.3)[0, 0]
-        assert sorted(probabilities) == pytest.approx([0.1, 0.1, 0.8])
-        assert values[probabilities.argmax()] == max(values)
+def test_of_equally_good_actions_the_first_is_best():
+    for values, best in ([0, 0, 0], 0), ([1, 2, 2], 1), ([3, 3, -1], 0):
+        expected = np.full(3, 0.1)
+        expected[best] = 0.8
+        assert play_probabilities(values, 0.3) == pytest.approx(expected)
 
 
 def test_drawn_actions_have_these_frequencies_and_the_likeliest_is_the_best():
-    values = np.random.default_rng(1).normal(size=(6, 1, 4))
-    policy, draws = FixedValues(values), 4000
-    log_probs = policy(None).view(3, 2, 4).numpy()
-    even = (np.arange(draws) + 0.5) / draws
-    actions = np.array([dqn.sample_actions(log_probs, np.full((3, 2), u)) for u in even])
-    best = values.reshape(3, 2, 4).argmax(-1)
-    assert np.array_equal(log_probs.argmax(-1), best)
-    frequencies = np.stack([(actions == a).mean(0) for a in range(4)], -1)
-    assert np.abs(frequencies - np.where(np.arange(4) == best[..., None], 0.9625, 0.0125)).max() < 2 / draws
+    even = (np.arange(4000) + 0.5) / 4000
+    for values in np.random.default_rng(1).normal(size=(6, 4)):
+        probs, best = play_probabilities(values, 0.05), values.argmax()
+        frequencies = np.bincount([draw_action(probs, u, False) for u in even], minlength=4) / len(even)
+        assert np.abs(frequencies - np.where(np.arange(4) == best, 0.9625, 0.0125)).max() < 2 / len(even)
+        assert draw_action(probs, 0.5, True) == best
 
 
-def test_a_part_of_the_policy_plays_as_the_whole():
-    policy = dqn.Policy(generators(0, 1, 2), 2, [4, 8, 5])
+def test_some_of_the_networks_say_what_they_say_among_all():
+    policy = dqn.StackedMLP(generators(0, 1, 2), 2, [4, 8, 5])
     obs = torch.rand(6, 1, 4, generator=torch.Generator().manual_seed(0))
-    assert float(torch.exp(policy(obs)).min()) == pytest.approx(0.01)  # what a saved team plays with
-    policy.epsilon = 0.5
-    nets = np.array([4, 5, 0])
-    assert torch.equal(policy.subset(nets)(obs[nets]), policy(obs)[nets])
+    nets = np.array([1, 0, 0, 0, 1, 1], bool)
+    assert torch.equal(dqn.some_of(policy, nets)(obs[nets]), policy(obs)[nets])
+    assert torch.equal(dqn.some_of(policy, slice(None))(obs), policy(obs))
+    assert len(policy.params[0]) == 6
 
 
 @pytest.mark.parametrize("exploration", [0.2, 1.0])
 def test_epsilon_falls_linearly_and_then_stays(exploration, tmp_path, monkeypatch):
-    seen, collect = [], dqn.collect
+    seen = []
 
-    def watched_collect(env, policy, *args):
-        seen.append(policy.epsilon)
-        collect(env, policy, *args)
-        assert policy.epsilon == seen[-1]
+    class WatchedRollout(dqn.Rollout):
+        def play(self, params, generators, epsilon):
+            assert self.head is envs.epsilon_greedy
+            seen.append(epsilon)
+            super().play(params, generators, epsilon)
 
-    monkeypatch.setattr(dqn, "collect", watched_collect)
+    monkeypatch.setattr(dqn, "Rollout", WatchedRollout)
     train(dqn, tmp_path, num_episodes=50, max_steps=3, exploration=exploration, log_every=1)
     expected = np.interp(np.arange(50), [0, 50 * exploration], [1, 0.05])
     assert seen == pytest.approx(expected)
     assert [value for _, value in curves(tmp_path / "seed1")["charts/epsilon"]] == pytest.approx(expected)
 
 
+def shares_of_best(policy, rollouts):
+    """How often the agents of the first trial have played what their networks say is best, in every rollout."""
+    obs, actions = (np.array(part) for part in zip(*((r.all_obs[:-1, 0], r.actions[:, 0]) for r in rollouts), strict=True))
+    best = policy(obs.reshape(-1, *obs.shape[2:]).swapaxes(0, 1)).argmax(-1).numpy().T.reshape(actions.shape)
+    return (best == actions).mean((1, 2))  # obs [episodes, steps, agents, obs_dim], actions [episodes, steps, agents]
+
+
 def test_agents_play_at_random_first_and_then_what_their_networks_say_is_best(tmp_path, monkeypatch):
-    played, collect = [], dqn.collect
-
-    def watched_collect(env, policy, uniforms, rollout):
-        collect(env, policy, uniforms, rollout)
-        played.append((rollout.obs[:-1, 0].copy(), rollout.actions[:, 0].copy()))
-
-    monkeypatch.setattr(dqn, "collect", watched_collect)
+    rollouts = record_rollouts(dqn, monkeypatch)
     policy = train(dqn, tmp_path, env="cleaner", num_episodes=20, exploration=0.5, learning_rate=0.0, train_every=100).policy
-    obs, actions = (torch.from_numpy(np.array(part)) for part in zip(*played, strict=True))  # [episodes, steps, agents, ..]
-    best = policy.q_values(obs.flatten(0, 1).transpose(0, 1)).argmax(-1).T.reshape(actions.shape) == actions
-    assert best[0].double().mean() == pytest.approx(0.25, abs=0.1)
-    assert best[10:].double().mean() == pytest.approx(0.9625, abs=0.015)
+    best = shares_of_best(policy, rollouts)
+    assert best[0] == pytest.approx(0.25, abs=0.1)
+    assert best[10:].mean() == pytest.approx(0.9625, abs=0.015)
+
+
+@pytest.mark.parametrize(("greedy", "share"), [(False, 0.9625), (True, 1)])
+def test_a_saved_team_plays_with_the_last_epsilon_or_greedily(greedy, share, tmp_path, monkeypatch):
+    train(dqn, tmp_path, env="cleaner", num_episodes=1, train_every=1000, save_model=True)
+    args, world, team = load(tmp_path / "policy.pt", dqn)
+    args.greedy, rollouts = greedy, record_rollouts(envs, monkeypatch)
+    play_teams(args, world, team, 10, tmp_path / "team.gif")
+    assert shares_of_best(team.policy, rollouts).mean() == pytest.approx(share, abs=0 if greedy else 0.015)
 
 
 # --- the replay ---
@@ -110,22 +109,23 @@ MAX_STEPS = 6
 
 
 def replay_of(trials, size):
-    return dqn.ConcurrentReplay(envs.make_vec("pushbox", trials, max_steps=MAX_STEPS), size)
+    return dqn.ConcurrentReplay(envs.make_world("pushbox", max_steps=MAX_STEPS), trials, size)
 
 
 def marked_rollout(episode, lengths, outcomes):
     """A rollout in whose observations, actions and rewards stand trial, agent, episode and time; nan where nothing was seen."""
     lengths, outcomes = np.array(lengths), np.array(outcomes)
-    trials = len(lengths)
-    obs = np.full((MAX_STEPS + 1, trials, 2, 5), np.nan, np.float32)
-    actions, reward = np.full((MAX_STEPS, trials, 2), -1), np.full((MAX_STEPS, trials), np.nan)
+    longest, trials = lengths.max(), len(lengths)
+    all_obs = np.full((longest + 1, trials, 2, 5), np.nan, np.float32)
+    actions, reward = np.full((longest, trials, 2), -1), np.full((longest, trials, 2), np.nan)
     for k in range(trials):
         for t in range(lengths[k] + 1):
             for i in range(2):
-                obs[t, k, i] = k, i, episode, t, 0
+                all_obs[t, k, i] = k, i, episode, t, 0
                 if t < lengths[k]:
-                    actions[t, k, i], reward[t, k] = 2 * (10 * episode + t) + i, 10 * episode + t
-    return SimpleNamespace(obs=obs, actions=actions, reward=reward, lengths=lengths, outcomes=outcomes)
+                    actions[t, k, i], reward[t, k, i] = 2 * (10 * episode + t) + i, 10 * episode + t
+    ends = dict(terminated=outcomes > 0, played=np.arange(longest)[:, None] < lengths)
+    return SimpleNamespace(all_obs=all_obs, actions=actions, reward=reward, lengths=lengths, outcomes=outcomes, **ends)
 
 
 @pytest.mark.parametrize("size", [3, 20, 200])
@@ -183,10 +183,10 @@ def random_batch(rng, nets, terminated):
     return obs, actions, next_obs, reward, torch.full((nets, 7), terminated).double()
 
 
-def double_policies(monkeypatch):
+def double_networks(monkeypatch):
     with monkeypatch.context() as patched:
         use_double_precision(dqn, patched)
-        return [dqn.Policy(generators(*seeds), 2, [3, 8, 4]) for seeds in ((0, 1), (2, 3))]
+        return [dqn.StackedMLP(generators(*seeds), 2, [3, 8, 4]) for seeds in ((0, 1), (2, 3))]
 
 
 def values(params, net, obs):
@@ -196,7 +196,7 @@ def values(params, net, obs):
 
 @pytest.mark.parametrize("terminated", [0, 1])
 def test_the_error_is_that_of_the_bellman_equation(terminated, monkeypatch):
-    policy, target = double_policies(monkeypatch)
+    policy, target = double_networks(monkeypatch)
     obs, actions, next_obs, reward, ended = random_batch(np.random.default_rng(terminated), 4, terminated)
     found = dqn.squared_td_errors(policy, target, (obs, actions, next_obs, reward, ended), 0.9)
     for net, b in np.ndindex(4, 7):
@@ -206,23 +206,23 @@ def test_the_error_is_that_of_the_bellman_equation(terminated, monkeypatch):
 
 
 def test_the_end_of_the_world_has_exactly_its_reward_as_target(monkeypatch):
-    policy, _ = double_policies(monkeypatch)
+    policy, _ = double_networks(monkeypatch)
     batch = random_batch(np.random.default_rng(0), 4, terminated=1)
     obs, actions, next_obs, reward, _ = batch
-    errors = [dqn.squared_td_errors(policy, target, batch, 0.9) for target in double_policies(monkeypatch)]
+    errors = [dqn.squared_td_errors(policy, target, batch, 0.9) for target in double_networks(monkeypatch)]
     errors.append(dqn.squared_td_errors(policy, policy, (obs, actions, 1e6 * next_obs, reward, batch[4]), 0.9))
-    q = policy.q_values(obs).gather(-1, actions[..., None])[..., 0]
+    q = policy(obs).gather(-1, actions[..., None])[..., 0]
     assert all(torch.equal(error, (reward - q) ** 2) for error in errors)
 
 
 def test_no_gradient_flows_through_the_target(monkeypatch):
-    policy, _ = double_policies(monkeypatch)
+    policy, _ = double_networks(monkeypatch)
     obs, actions, next_obs, reward, ended = random_batch(np.random.default_rng(0), 4, terminated=0)
     found = torch.autograd.grad(
         dqn.squared_td_errors(policy, policy, (obs, actions, next_obs, reward, ended), 0.9).sum(), policy.params
     )
-    y = (reward + 0.9 * policy.q_values(next_obs).amax(-1)).detach()
-    error = y - policy.q_values(obs).gather(-1, actions[..., None])[..., 0]
+    y = (reward + 0.9 * policy(next_obs).amax(-1)).detach()
+    error = y - policy(obs).gather(-1, actions[..., None])[..., 0]
     expected = torch.autograd.grad(error.square().sum(), policy.params)
     assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
@@ -232,26 +232,26 @@ def test_no_gradient_flows_through_the_target(monkeypatch):
 
 def test_independent_learners_of_the_climb_game_learn_the_means_over_their_teammates_actions():
     """Relative over-generalisation: where 11 and 7 are to be had, they end up with 5."""
-    policy = dqn.Policy(generators(0), 2, [1, 16, 3])
-    optimizer = dqn.StackedOptimizer(policy.params, "adam", 0.01)
+    policy = dqn.StackedMLP(generators(0), 2, [1, 16, 3])
+    optimizer = dqn.MaskedAdam(policy.params, 1, 0.01)
     actions = torch.cartesian_prod(torch.arange(3), torch.arange(3)).T  # all joint actions, [2, 9]
     reward, ones = torch.from_numpy(CLIMB).float().reshape(1, 9).repeat(2, 1), torch.ones(2, 9, 1)
     for _ in range(800):
         loss = dqn.squared_td_errors(policy, policy, (ones, actions, ones, reward / 10, ones[..., 0]), 0.9).mean(1).sum()
-        optimizer.step(torch.autograd.grad(loss, policy.params))
-    found = 10 * policy.q_values(ones[:, :1]).detach().numpy()[:, 0]
+        optimizer.step(loss, np.array([True]))
+    found = 10 * policy(ones[:, :1]).detach().numpy()[:, 0]
     assert np.abs(found - [CLIMB.mean(1), CLIMB.mean(0)]).max() < 0.01
     assert found.argmax(1).tolist() == [2, 2]
 
 
-@njit
+@envs.rule
 def stay(rules, state, actions):
     """One state and a reward of 1; the world ends with step `rules[0]`."""
     state[0] += 1
     return 1.0, 1 if state[0] == rules[0] else 0
 
 
-@njit
+@envs.rule
 def see_nothing(rules, cell, state, obs):
     obs[:] = 1.0
 
@@ -267,13 +267,58 @@ class Loop(envs.World):
 def test_the_time_limit_bootstraps_and_an_end_does_not(ends, expected, tmp_path, monkeypatch):
     """Episodes of 5 steps, gamma 0.9: 1 + 0.9 + .. for ever, if the time limit cuts; else one of 5 steps is the last."""
     world = Loop(np.array([ends]), [0], [[0], [0]], num_agents=2, obs_dim=1, cell=1.0, state_scale=[1.0], max_steps=5)
-    monkeypatch.setattr(dqn, "resolve", lambda args: (args, envs.GridVectorEnv(world, args.num_trials)))
+    monkeypatch.setattr(dqn, "resolve", lambda args, *_: (args, world))
     args = dict(env="loop", hidden=(16,), gamma=0.9, exploration=1.0, learning_rate=1e-3, num_episodes=300)
     policy = train(dqn, tmp_path, **args, train_every=1, target_every=20, batch_size=2000, buffer_size=500).policy
-    assert 10 * policy.q_values(torch.ones(2, 1, 1)).detach().numpy() == pytest.approx(np.full((2, 1, 1), expected), rel=0.05)
+    assert 10 * policy(torch.ones(2, 1, 1)).detach().numpy() == pytest.approx(np.full((2, 1, 1), expected), rel=0.05)
+
+
+# --- the steps ---
+
+
+def test_the_optimiser_is_torchs_adam_for_each_trial_by_its_own_count():
+    rng, policy = np.random.default_rng(1), dqn.StackedMLP(generators(0, 1, 2, 3), 2, [3, 5, 2])
+    optimizer = dqn.MaskedAdam(policy.params, 4, 0.01)
+    single = [[param[2 * k : 2 * k + 2].detach().clone() for param in policy.params] for k in range(4)]
+    adams = [torch.optim.Adam(own, lr=0.01) for own in single]
+    for step in range(60):
+        grads = [
+            torch.from_numpy(rng.normal(size=p.shape) * 10.0 ** rng.integers(-6, 4, p.shape)).float() for p in policy.params
+        ]
+        active = rng.random(4) < ([1, 1, 1, 1] if step % 5 == 0 else [0, 0.5, 0.9, 0.5])
+        before, kept = weights(policy), [array.copy() for array in optimizer.state]
+        optimizer.step(sum((grad * param).sum() for grad, param in zip(grads, policy.params, strict=True)), active)
+        for old, new in zip([*kept, *before], [*optimizer.state, *weights(policy)], strict=True):
+            still = ~active.repeat(len(new) // 4)
+            assert np.array_equal(new[still], old[still])
+        for k in np.flatnonzero(active):
+            for param, grad in zip(single[k], grads, strict=True):
+                param.grad = grad[2 * k : 2 * k + 2]
+            adams[k].step()
+        for k in range(4):
+            for stacked, own in zip(policy.params, single[k], strict=True):
+                assert torch.allclose(stacked[2 * k : 2 * k + 2], own, rtol=0, atol=1e-5)
+    counts = [int(adam.state[own[0]]["step"]) for adam, own in zip(adams, single, strict=True)]
+    assert optimizer.count.tolist() == counts
+    assert len(set(counts)) > 1
 
 
 # --- whole runs ---
+
+
+def record_updates(monkeypatch):
+    """A list that gets every `Update` that the script makes from now on."""
+    updates, rollouts = [], record_rollouts(dqn, monkeypatch)
+
+    class WatchedAdam(dqn.MaskedAdam):
+        def step(self, loss, active):
+            grads = torch.autograd.grad(loss, self.weights, retain_graph=True)
+            params = [param.detach().clone() for param in self.weights]
+            updates.append(Update(rollouts[-1], params, [-grad for grad in grads]))
+            super().step(loss, active)
+
+    monkeypatch.setattr(dqn, "MaskedAdam", WatchedAdam)
+    return updates
 
 
 class PlainTrial:
@@ -289,7 +334,7 @@ class PlainTrial:
         before = self.count
         for t in range(rollout.lengths[k]):
             terminated = t + 1 == rollout.lengths[k] and rollout.outcomes[k] > 0
-            step = rollout.obs[t, k], rollout.actions[t, k], rollout.reward[t, k], rollout.obs[t + 1, k], terminated
+            step = rollout.all_obs[t, k], rollout.actions[t, k], rollout.reward[t, k, 0], rollout.all_obs[t + 1, k], terminated
             row = self.count % self.size
             self.ring[row : row + 1] = [step]  # appends until the ring is full
             self.count += 1
@@ -320,11 +365,11 @@ def same(some, others):
 def test_every_update_descends_the_mean_squared_error_of_its_batch(env, tmp_path, monkeypatch):
     """All updates of 3 trials against the method by plain loops: which steps, how many updates, along which direction."""
     use_double_precision(dqn, monkeypatch)
-    updates = record_updates(dqn, monkeypatch)
+    updates = record_updates(monkeypatch)
     every = dict(batch_size=5, train_every=3, target_every=20)
     args = dict(env=env, seed=4, num_trials=3, num_episodes=12, max_steps=11, learning_rate=0.05, gamma=0.9, log_every=1)
     run = train(dqn, tmp_path, **args, **every, buffer_size=30)
-    afters = [*(update.params for update in updates[1:]), run.policy.params]
+    afters = [*(update.params for update in updates[1:]), weights(run.policy)]
     episodes = [list(group) for _, group in groupby(zip(updates, afters, strict=True), key=lambda pair: id(pair[0].rollout))]
     assert len(episodes) == 12
     copies, counts = 0, []
@@ -344,10 +389,10 @@ def test_every_update_descends_the_mean_squared_error_of_its_batch(env, tmp_path
             if copied:
                 trial.target = after
                 copies += 1
-            start = [values(after, agent, rollout.obs[0, k, agent]).max() for agent in range(2)]
-            assert value[episode] == (episode + 1, pytest.approx(10 * np.mean(start), rel=1e-5))
+            start = [values(after, agent, rollout.all_obs[0, k, agent]).max() for agent in range(2)]
+            assert value[episode] == (trial.count, pytest.approx(10 * np.mean(start), rel=1e-5))
             counts.append((len(batches), len(pairs)))
-        assert same(of_trial(run.target.params, k), trial.target)
+        assert same(of_trial(weights(run.target), k), trial.target)
         assert trial.count > 60  # the ring has turned twice
     assert copies >= 9
     due, made = np.array(counts).reshape(3, 12, 2).transpose(2, 0, 1)

@@ -53,7 +53,7 @@ def test_every_update_climbs_along_equations_14_to_16(name, world, tmp_path, mon
     for n, (rollout, params, direction) in enumerate(updates):
         steps_of = []
         for k, length in enumerate(rollout.lengths):
-            obs, actions, reward = rollout.obs[:length, k], rollout.actions[:length, k], rollout.reward[:length, k]
+            obs, actions, reward = rollout.all_obs[:length, k], rollout.actions[:length, k], rollout.reward[:length, k, 0]
             bonus, etas = np.zeros((agents, length)), []
             for w, members in enumerate(sharing):
                 now = np.concatenate([pairs(obs[:, i], actions[:, i], num_actions) for i in members], axis=1)
@@ -64,7 +64,7 @@ def test_every_update_climbs_along_equations_14_to_16(name, world, tmp_path, mon
                 etas = np.array(etas)
                 for tag, values in dict(bonus=bonus, unvisited=etas < 1e-3, overvisited=etas > 1).items():
                     value = values.mean()
-                    assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(value, abs=1e-6))
+                    assert shown[k][f"charts/{tag}"][n][1] == pytest.approx(value, abs=1e-6)
 
             episode = obs, actions, np.array(plain_returns(reward, gamma))
             best = kept[k].setdefault(int(rollout.outcomes[k]), [])
@@ -110,17 +110,38 @@ def bonuses(module, directory, **args):
 
 
 @pytest.mark.parametrize("name", [name for name, bonus in BONUS.items() if bonus])
+def test_the_bonus_of_a_pair_can_be_asked_for_without_recording_a_visit(name, tmp_path):
+    kernel = dict(window=7, sigma=0.9, noise=0.2)
+    args = dict(env="findtreasure", num_trials=2, num_episodes=2, max_steps=3)
+    team = train(script(name), tmp_path, **args, **own_args(name, beta=0.1, slots=1, **kernel))
+    novelty, rng = team.novelty, np.random.default_rng(0)
+    before = [array.copy() for array in novelty.state]
+    trials, windows, dim, _ = novelty.pairs.shape
+    asked = rng.random((trials, windows, 4, dim)).astype(np.float32)
+    asked[:, :, 0] = novelty.pairs[:, :, :, 1]
+    found = novelty.at(asked)
+    assert all(map(np.array_equal, before, novelty.state))
+    for k, w in np.ndindex(trials, windows):
+        held = novelty.visits[k]
+        past = novelty.pairs[k, w].T[:held].astype(np.float32)
+        for n in range(4):
+            eta = dense_eta(np.concatenate([past, asked[k, w, n : n + 1]]), held, **{**kernel, "sigma": novelty.sigma})
+            assert found[k, w, n] == pytest.approx(-np.log(np.clip(eta, 1e-3, 1)), abs=1e-8)
+    assert found[:, :, 0].max() < found[:, :, 1:].min()
+
+
+@pytest.mark.parametrize("name", [name for name, bonus in BONUS.items() if bonus])
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
 def test_exchanging_agents_exchanges_private_bonuses_and_leaves_the_central_one(name, env, tmp_path, monkeypatch):
     module, args = script(name), dict(env=env, num_trials=2, num_episodes=10, max_steps=30)
     before = bonuses(module, tmp_path / "before", **args)
-    collect = module.collect
 
-    def collect_exchanged(env, policy, uniforms, rollout, frames=None):
-        collect(env, policy, uniforms, rollout, frames)
-        rollout.obs[:], rollout.actions[:] = rollout.obs[:, :, ::-1].copy(), rollout.actions[:, :, ::-1].copy()
+    class ExchangedRollout(module.Rollout):
+        def play(self, *args):
+            super().play(*args)
+            self.all_obs[:], self.actions[:] = self.all_obs[:, :, ::-1].copy(), self.actions[:, :, ::-1].copy()
 
-    monkeypatch.setattr(module, "collect", collect_exchanged)
+    monkeypatch.setattr(module, "Rollout", ExchangedRollout)
     after = bonuses(module, tmp_path / "after", **args)
     for values, exchanged in zip(before, after, strict=True):
         assert values.shape[2] == (2 if BONUS[name] == PRIVATE else 1)

@@ -13,7 +13,7 @@ NUM_ACTIONS, MAX_STEPS = 4, 6
 
 
 def memory(trials=1, slots=2):
-    return decespg.SelectiveMemory(envs.make_vec("pushbox", trials, max_steps=MAX_STEPS), slots)
+    return decespg.SelectiveMemory(envs.make_world("pushbox", max_steps=MAX_STEPS), trials, slots)
 
 
 def played(rng, *episodes):
@@ -21,7 +21,7 @@ def played(rng, *episodes):
     outcomes, lengths = np.array(episodes).T
     obs = np.eye(5, dtype=np.float32)[rng.integers(5, size=(MAX_STEPS, len(episodes), 2))]
     actions = rng.integers(NUM_ACTIONS, size=(MAX_STEPS, len(episodes), 2))
-    return SimpleNamespace(obs=obs, actions=actions, lengths=lengths, outcomes=outcomes)
+    return SimpleNamespace(all_obs=obs, actions=actions, lengths=lengths, outcomes=outcomes)
 
 
 def remember(kept, rng, value, outcome=1, length=3):
@@ -30,7 +30,7 @@ def remember(kept, rng, value, outcome=1, length=3):
     returns = np.zeros((MAX_STEPS, 1))
     returns[:length, 0] = value * 0.5 ** np.arange(length)
     kept.remember(rollout, returns)
-    return rollout.obs[:length, 0].copy(), rollout.actions[:length, 0].copy(), returns[:length, 0]
+    return rollout.all_obs[:length, 0].copy(), rollout.actions[:length, 0].copy(), returns[:length, 0]
 
 
 def assert_replays(kept, *episodes, trial=0):
@@ -98,6 +98,6 @@ def test_trials_remember_for_themselves():
         rollout = played(rng, (outcomes[0], 4), (outcomes[1], 2))
         returns = rng.random((MAX_STEPS, 2))
         kept.remember(rollout, returns)
-        steps.append([(rollout.obs[:n, k], rollout.actions[:n, k], returns[:n, k]) for k, n in enumerate((4, 2))])
+        steps.append([(rollout.all_obs[:n, k], rollout.actions[:n, k], returns[:n, k]) for k, n in enumerate((4, 2))])
         for k in range(2):
             assert_replays(kept, *[both[k] for both in steps], trial=k)
