@@ -255,7 +255,7 @@ class Rollout:
         running, self.finite = np.ones(len(self.lengths), bool), True
         self.lengths[:], self.entropy[:], self._states[0] = 0, 0.0, world.start
         for t in range(world.max_steps):
-            probs = np.array(policy(self._all_obs[t].copy()), np.float64)
+            probs = np.asarray(policy(self._all_obs[t].copy())).astype(np.float64)
             self.finite = self.finite and bool(np.isfinite(probs).all())
             self._actions[t] = 0
             for k, i in np.ndindex(probs.shape[:2]):
