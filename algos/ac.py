@@ -1,6 +1,6 @@
 """AC: decentralised actors with one centralised critic (Williams, 1992; Sutton & Barto, Section 13.5), on the base of pg.py.
 
-While the team learns, a critic V sees s_t, which is the global state and the joint observation. After each episode of T steps
+While the team learns, a critic V sees the global state s_t. After each episode of T steps
 
     delta_t = r_t + gamma V(s_{t+1}) - V(s_t)                    is the critic's one-step error, the same for all agents,
     g_i = 1/T sum_t delta_t grad log pi_i(a_t | o_t)             is the direction along which every actor i climbs, and
@@ -8,7 +8,8 @@ While the team learns, a critic V sees s_t, which is the global state and the jo
 
 Both learn from the delta_t of the critic before its step. Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed
 Exploration and Selective Memory Reuse" (SAC 2021), say of their AC only that it is "vanilla" and its critic "centralized"
-(Section 4.2). One-step errors, a critic with the hidden layers of Table 1 and its single step per episode are chosen here.
+(Section 4.2). What the critic sees, one-step errors, its hidden layers, those of Table 1, and its single step per episode are
+chosen here.
 
     python algos/ac.py --env findtreasure --num-trials 20
 """
@@ -101,15 +102,6 @@ def update(optimizer, kind, loss):
     optimizer.step()
 
 
-def critic_inputs(rollout):
-    """What the critic sees of every step, and after the last: the global state and the joint observation.
-
-    -> [T + 1, num_trials, 1, state_dim + num_agents * obs_dim]
-    """
-    joint_obs = rollout.all_obs.reshape(*rollout.all_obs.shape[:2], -1)
-    return np.concatenate([rollout.global_state, joint_obs], axis=2)[:, :, None]
-
-
 def td_errors(reward, values, lengths, terminated, gamma):
     """delta_t = r_t + gamma V(s_{t+1}) - V(s_t) of every step, 0 beyond an episode's end.
 
@@ -126,7 +118,7 @@ def build(args, world, init):
     """All that learns or remembers, for all trials; `init` are the generators of the first weights."""
     return SimpleNamespace(
         policy=StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions]),
-        critic=StackedMLP(init, 1, [len(world.start) + world.num_agents * world.obs_dim, *args.hidden, 1]),
+        critic=StackedMLP(init, 1, [len(world.start), *args.hidden, 1]),
     )
 
 
@@ -144,8 +136,8 @@ def train(args: Args):
         rollout.play(team.policy.params, act)
 
         # The critic's values and errors, before it learns from this episode.
-        inputs, rows = distinct_rows(critic_inputs(rollout), rollout.lengths + 1)
-        values = in_every_step(team.critic(inputs), rows)[:, :, 0, 0]  # [T + 1, num_trials]
+        states, rows = distinct_rows(rollout.global_state[:, :, None], rollout.lengths + 1)
+        values = in_every_step(team.critic(states), rows)[:, :, 0, 0]  # [T + 1, num_trials]
         detached = values.detach().double().numpy()
         delta = td_errors(rollout.reward[:, :, 0] / REWARD_SCALE, detached, rollout.lengths, rollout.terminated, args.gamma)
 

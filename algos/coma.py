@@ -1,8 +1,7 @@
 """COMA: decentralised actors whose critics ask what each agent's own action has added (Foerster et al., 2018), as ac.py else.
 
-While the team learns, agent i has a critic Q_i that sees x_i,t = (the global state, the joint observation, the actions of the
-other agents) and says what each of agent i's own actions is worth. After each episode of T steps, with the critics before their
-step,
+While the team learns, agent i has a critic Q_i that sees x_i,t = (the global state, the actions of the other agents) and says
+what each of agent i's own actions is worth. After each episode of T steps, with the critics before their step,
 
     A_i,t = Q_i(x_i,t, a_i,t) - sum_a pi_i(a | o_i,t) Q_i(x_i,t, a)      (Eq. 4) is what the agent's action has added,
     g_i = 1/T sum_t A_i,t grad log pi_i(a_i,t | o_i,t)                   is the direction along which actor i climbs, and
@@ -12,7 +11,9 @@ step,
 Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), compare
 with COMA but give no settings. lambda is that of Foerster et al.; a critic for each agent and the 200 critic steps between two
 copies of Q to Q' are those of EPyMARL's coma_ns. The hidden layers of Table 1, one critic step per episode, and policies that
-explore by themselves (no floor under their probabilities) are chosen here.
+explore by themselves (no floor under their probabilities) are chosen here. So is that the critics do not see the observations
+beside the state, which tells them: with both, 2 of 20 trials in pushbox end at the large box (adam, 5000 episodes, learning rates
+3e-4 and 1e-3), with the state alone 18, with the observations alone none.
 
     python algos/coma.py --env findtreasure --num-trials 20
 """
@@ -121,18 +122,16 @@ def next_actions(policy, rollout, generators):
     return (uniforms[:, :, None] >= bounds[:, :, :-1]).sum(2)
 
 
-def critic_inputs(rollout, actions, num_actions):
-    """x_i of every step, and after the last: as in ac.py, and the one-hot actions of all but agent i, i + 1 first.
+def critic_inputs(global_state, actions, num_actions):
+    """x_i of every step: the global state, and the one-hot actions of all but agent i, i + 1 first.
 
-    actions [T + 1, num_trials, num_agents]
-    -> [T + 1, num_trials, num_agents, state_dim + num_agents * obs_dim + (num_agents - 1) * num_actions]
+    global_state [T + 1, num_trials, state_dim], actions [T + 1, num_trials, num_agents]
+    -> [T + 1, num_trials, num_agents, state_dim + (num_agents - 1) * num_actions]
     """
-    steps, trials, agents = actions.shape
-    joint_obs = rollout.all_obs.reshape(steps, trials, -1)
-    seen = np.concatenate([rollout.global_state, joint_obs], axis=2)[:, :, None].repeat(agents, axis=2)
+    agents = actions.shape[2]
     others = (np.arange(agents)[:, None] + np.arange(1, agents)) % agents
-    others_actions = np.eye(num_actions, dtype=np.float32)[actions[:, :, others]].reshape(steps, trials, agents, -1)
-    return np.concatenate([seen, others_actions], axis=3)
+    others_actions = np.eye(num_actions, dtype=np.float32)[actions[:, :, others]].reshape(*actions.shape, -1)
+    return np.concatenate([global_state[:, :, None].repeat(agents, axis=2), others_actions], axis=3)
 
 
 def counterfactual_advantages(values, probs, actions):
@@ -161,7 +160,7 @@ def lambda_targets(reward, values, lengths, terminated, gamma, td_lambda):
 
 def build(args, world, init):
     """All that learns or remembers, for all trials; `init` are the generators of the first weights."""
-    critic_dim = len(world.start) + world.num_agents * world.obs_dim + (world.num_agents - 1) * world.num_actions
+    critic_dim = len(world.start) + (world.num_agents - 1) * world.num_actions
     policy = StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])
     critic = StackedMLP(init, world.num_agents, [critic_dim, *args.hidden, world.num_actions])
     return SimpleNamespace(policy=policy, critic=critic, target_critic=deepcopy(critic))
@@ -185,7 +184,7 @@ def train(args: Args):
         # The critics' values, before they learn from this episode, and their targets.
         actions = np.concatenate([rollout.actions, rollout.actions[:1]])  # [T + 1, num_trials, num_agents]
         actions[rollout.lengths, trials] = next_actions(team.policy, rollout, learn)
-        inputs, rows = distinct_rows(critic_inputs(rollout, actions, world.num_actions), rollout.lengths + 1)
+        inputs, rows = distinct_rows(critic_inputs(rollout.global_state, actions, world.num_actions), rollout.lengths + 1)
         values = in_every_step(team.critic(inputs), rows)[:-1]  # [T, num_trials, num_agents, num_actions]
         with torch.no_grad():
             target_values = in_every_step(team.target_critic(inputs), rows).double().numpy()
