@@ -231,8 +231,9 @@ class ExemplarNovelty:
 
     def at(self, pairs):
         """EB of any pairs [num_trials, num_windows, n, pair_dim], which are not remembered -> [num_trials, num_windows, n]."""
-        surprise = self.discriminator.surprise(torch.as_tensor(pairs, dtype=torch.float32).flatten(0, 1)).numpy()
-        return surprise.clip(0, np.log(1e5 - 1)).reshape(pairs.shape[:3])
+        surprise = self.discriminator.surprise(torch.as_tensor(pairs, dtype=torch.float32).flatten(0, 1)).double().numpy()
+        fitted = (self.optimizer.count > 0)[:, None, None]
+        return np.where(fitted, surprise.clip(0, np.log(1e5 - 1)).reshape(pairs.shape[:3]), 0.0)
 
     def fit(self, pairs, lengths, fits, enough):
         """Several steps of Adam for the discriminators of the trials in the mask `enough`."""

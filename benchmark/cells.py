@@ -2,7 +2,9 @@
 
 import hashlib
 import importlib
+import importlib.util
 import json
+import os
 import sys
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
@@ -13,11 +15,12 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
+from envs import run
 
 RUNS = ROOT / "runs" / "comparison"
 WORLDS = tuple(envs.WORLDS)
 OPTIMIZERS = ("sign", "adam")
-# In the order of the paper and of every table.
+# The paper's, in the order of every table. Any other script, of algos/ or named by its path, is called as its file is.
 METHODS = {
     "pg": "PG",
     "epg": "EPG",
@@ -36,10 +39,26 @@ METHODS = {
 }
 
 
+def name_of(method):
+    """What tables and figures call a method."""
+    return METHODS.get(method, Path(method).stem)
+
+
+def path_of(method):
+    """The file of a method: algos/<method>.py, or `method` itself if it ends in .py."""
+    return Path(method).resolve() if str(method).endswith(".py") else ROOT / "algos" / f"{method}.py"
+
+
 @cache
 def script(method):
-    """A script of algos/ as a module."""
-    return importlib.import_module(f"algos.{method}")
+    """A script as a module."""
+    path = path_of(method)
+    if path.parent == ROOT / "algos":
+        return importlib.import_module(f"algos.{path.stem}")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def has_policies(method):
@@ -62,7 +81,8 @@ class Cell:
     @property
     def arguments(self):
         """What the script is told, {argument: value}."""
-        told = dict(env=self.world, seed=self.first_seed, num_trials=self.num_trials)
+        world = self.world if self.world in WORLDS else str(Path(self.world).resolve())
+        told = dict(env=world, seed=self.first_seed, num_trials=self.num_trials)
         if has_policies(self.method):
             told["optimizer"] = self.optimizer
         return told if self.num_episodes is None else {**told, "num_episodes": self.num_episodes}
@@ -71,15 +91,16 @@ class Cell:
     def settings(self):
         """Everything that the result depends on: the arguments with their defaults filled in, as args.json holds them."""
         module = script(self.method)
-        args, _ = module.resolve(module.Args(**self.arguments))
-        values = {name: value for name, value in vars(args).items() if name not in module.HOUSEKEEPING}
-        return json.loads(json.dumps({"method": self.method, **values}))
+        args, _ = run.resolve(module.Args(**self.arguments), module.WORLDS, module.TUNED, module.OTHER)
+        values = {name: value for name, value in vars(args).items() if name not in run.HOUSEKEEPING}
+        return json.loads(json.dumps({"method": path_of(self.method).stem, **values}))
 
     @property
     def name(self):
         """Short, unique among cells of the same settings."""
         seeds = f"{self.first_seed}-{self.first_seed + self.num_trials - 1}"
-        return f"{self.world}/{self.method}/{self.optimizer}-seeds{seeds}-episodes{self.settings['num_episodes']}"
+        where = f"{Path(self.world).stem}/{path_of(self.method).stem}"
+        return f"{where}/{self.optimizer}-seeds{seeds}-episodes{self.settings['num_episodes']}"
 
     @property
     def run_dir(self):
@@ -96,7 +117,8 @@ class Cell:
     def command(self):
         """The command that runs the cell from its beginning."""
         words = [word for name, value in self.arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-        return [sys.executable, f"algos/{self.method}.py", *words, "--run-dir", str(self.run_dir), "--save-model"]
+        script_file = os.path.relpath(path_of(self.method), ROOT)  # cells are run there
+        return [sys.executable, script_file, *words, "--run-dir", str(self.run_dir), "--save-model"]
 
     @property
     def finished(self):
@@ -125,8 +147,7 @@ class Cell:
 def settings_of(run_dir):
     """The settings of a run that is there, in the form of `Cell.settings`."""
     about = json.loads((run_dir / "args.json").read_text())
-    housekeeping = script(about["method"]).HOUSEKEEPING
-    return {"method": about["method"], **{k: v for k, v in about["args"].items() if k not in housekeeping}}
+    return {"method": about["method"], **{k: v for k, v in about["args"].items() if k not in run.HOUSEKEEPING}}
 
 
 def select(methods, worlds, optimizers, **block):

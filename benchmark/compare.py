@@ -23,15 +23,15 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmark import results
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, select
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, select
 
 
 @dataclass
 class Args:
     algos: tuple[str, ...] = tuple(METHODS)
-    """scripts of algos/, without .py"""
+    """scripts of algos/ without .py, or files such as my_method.py"""
     envs: tuple[str, ...] = WORLDS
-    """worlds"""
+    """worlds, or files such as my_world.py"""
     optimizers: tuple[Literal["sign", "adam"], ...] = OPTIMIZERS
     """optimisers of the policies"""
     seeds: str = "1-20"
@@ -62,7 +62,7 @@ def pace():
 
 def remaining_seconds(cell, done=0):
     """A guess of how long a cell still takes after `done` episodes; nearly in proportion to the trials."""
-    return pace()[cell.method, cell.world] * (cell.settings["num_episodes"] - done) * cell.num_trials / 20
+    return pace().get((cell.method, cell.world), 0.05) * (cell.settings["num_episodes"] - done) * cell.num_trials / 20
 
 
 def progress(cell):
@@ -222,10 +222,12 @@ def refuse(message):
 
 def selection(args):
     """The cells that the arguments select."""
-    for what, words, known in (("script", args.algos, METHODS), ("world", args.envs, WORLDS)):
-        for word in words:
-            if word not in known:
-                refuse(f"there is no {what} {word!r}; there is {', '.join(known)}.")
+    for word in args.algos:
+        if not path_of(word).is_file():
+            refuse(f"there is no script {word!r}; there is {', '.join(METHODS)}, or a file such as my_method.py.")
+    for word in args.envs:
+        if word not in WORLDS and not (word.endswith(".py") and Path(word).is_file()):
+            refuse(f"there is no world {word!r}; there is {', '.join(WORLDS)}, or a file such as my_world.py.")
     if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", args.seeds)) or int(found[2] or found[1]) < int(found[1]):
         refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
     for name in ("episodes", "jobs"):

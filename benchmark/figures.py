@@ -1,12 +1,14 @@
 """The figures of the comparison, each a function of the kept results that returns a matplotlib figure."""
 
+from pathlib import Path
+
 import matplotlib
 import numpy as np
 
 import envs
 from benchmark import statistics
-from benchmark.cells import METHODS, OPTIMIZERS, WORLDS
-from benchmark.results import BLOCK
+from benchmark.cells import OPTIMIZERS, WORLDS, name_of
+from benchmark.results import BLOCK, named_in
 from envs.drawing import AGENTS
 
 matplotlib.use("Agg")
@@ -18,6 +20,7 @@ COLOURS = {
     **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#b3a100", "dqn": "#000000", "edti": "#882255"},
     **{"decespg_ex2": "#009e73", "espg_icm": "#d55e00", "espg_emi": "#cc79a7", "gasil": "#e69f00"},
 }
+OTHERS = ("#332288", "#44aa99", "#aa4499", "#999933")  # of scripts that are not the paper's
 DASHES = {
     "ac": "--",
     "coma": "--",
@@ -36,9 +39,15 @@ FIGURES = {
 }
 
 
-def panels(results, methods, ylabel, draw, worlds=WORLDS):
+def colour_of(method):
+    """A method's colour; a script that is not the paper's has the same of OTHERS in every figure."""
+    return COLOURS.get(method) or OTHERS[sum(method.encode()) % len(OTHERS)]
+
+
+def panels(results, methods, ylabel, draw, worlds=None):
     """A panel for each world and optimiser; draw(axis, world, method, result) draws one method there."""
-    worlds = [world for world in worlds if any((world, m, o) in results for m in methods for o in OPTIMIZERS)]
+    there = {world for world, method, _ in results if method in methods}
+    worlds = [world for world in worlds or named_in(results)[0] if world in there]
     rows, columns = len(OPTIMIZERS), len(worlds)
     figure, axes = plt.subplots(rows, columns, figsize=(3.4 * columns, 2.6 * rows), layout="constrained", squeeze=False)
     for row, optimizer in enumerate(OPTIMIZERS):
@@ -47,20 +56,20 @@ def panels(results, methods, ylabel, draw, worlds=WORLDS):
             axis.set_visible(bool(found))
             for method, result in found.items():
                 draw(axis, world, method, result)
-            axis.set_title(f"{world}, {optimizer}", fontsize="medium")
+            axis.set_title(f"{Path(world).stem}, {optimizer}", fontsize="medium")
             axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     figure.supylabel(ylabel, fontsize="medium")
     figure.supxlabel("episode", fontsize="medium")
     labels = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    names = [name for name in (*(METHODS[method] for method in methods), "exact optimum") if name in labels]
+    names = [name for name in (*(name_of(method) for method in methods), "exact optimum") if name in labels]
     figure.legend([labels[name] for name in names], names, loc="outside right center", frameon=False)
     return figure
 
 
 def line(axis, method, values, error=None):
     """A curve of block means [blocks], with a band of its error."""
-    episodes, colour = (np.arange(len(values)) + 1) * BLOCK, COLOURS[method]
-    axis.plot(episodes, values, DASHES.get(method, "-"), color=colour, label=METHODS[method], linewidth=1.3)
+    episodes, colour = (np.arange(len(values)) + 1) * BLOCK, colour_of(method)
+    axis.plot(episodes, values, DASHES.get(method, "-"), color=colour, label=name_of(method), linewidth=1.3)
     if error is not None:
         axis.fill_between(episodes, values - error, values + error, color=colour, alpha=0.2, linewidth=0)
 
@@ -83,7 +92,7 @@ def share_at_best(results, methods):
         line(axis, method, (result.at_best > 0.5).mean(0))
         axis.set_ylim(-0.03, 1.03)
 
-    worlds = [world for world in WORLDS if envs.make_world(world).outcome_names]
+    worlds = [world for world in named_in(results)[0] if envs.make_world(world).outcome_names]
     return panels(results, methods, "share of trials at the best outcome", draw, worlds)
 
 
@@ -94,9 +103,9 @@ def intervals(estimates, xlabel):
     figure, axes = plt.subplots(1, len(estimates), figsize=size, layout="constrained", squeeze=False, sharex=True)
     for axis, (optimizer, found) in zip(axes[0], estimates.items(), strict=True):
         for row, (method, (value, low, high)) in enumerate(found.items()):
-            axis.plot([low, high], [row, row], color=COLOURS[method], linewidth=6, alpha=0.4, solid_capstyle="butt")
-            axis.plot([value], [row], "|", color=COLOURS[method], markersize=11, markeredgewidth=2.5)
-        axis.set_yticks(range(len(found)), [METHODS[method] for method in found])
+            axis.plot([low, high], [row, row], color=colour_of(method), linewidth=6, alpha=0.4, solid_capstyle="butt")
+            axis.plot([value], [row], "|", color=colour_of(method), markersize=11, markeredgewidth=2.5)
+        axis.set_yticks(range(len(found)), [name_of(method) for method in found])
         axis.invert_yaxis()
         axis.grid(axis="x", alpha=0.3)
         axis.set_title(optimizer, fontsize="medium")
@@ -124,7 +133,7 @@ def trajectories(results, methods=("pg", "decespg"), optimizer="sign"):
             axis.imshow(envs.draw(world, states[-1], cell=24))
             for i in range(world.num_agents):
                 draw_way(axis, [agent_places(world, state)[i] for state in states], AGENTS[i], i / world.num_agents)
-            axis.set_title(f"{name}\n{METHODS[method]}, {len(states) - 1} steps", fontsize="medium")
+            axis.set_title(f"{name}\n{name_of(method)}, {len(states) - 1} steps", fontsize="medium")
             axis.set_axis_off()
     return figure
 

@@ -19,8 +19,8 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmark.cells import METHODS, ROOT, script
-from benchmark.figures import COLOURS, DASHES
+from benchmark.cells import ROOT, name_of, script
+from benchmark.figures import DASHES, colour_of
 from benchmark.report import markdown
 
 matplotlib.use("Agg")
@@ -67,7 +67,7 @@ def draw(curves, worlds, path):
     for axis, world in zip(axes[0], worlds, strict=True):
         for (method, where), bonuses in curves.items():
             if where == world:
-                mean, look = bonuses.mean(0), dict(color=COLOURS[method], label=METHODS[method])
+                mean, look = bonuses.mean(0), dict(color=colour_of(method), label=name_of(method))
                 axis.plot(np.arange(VISITS) + 1, mean / mean.max(), DASHES.get(method, "-"), **look)
         axis.set_xscale("log")
         axis.set_ylim(-0.03, 1.03)

@@ -21,7 +21,7 @@ from matplotlib import pyplot as plt
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark import figures, results, statistics
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, script, select
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, select
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -41,15 +41,17 @@ def score_table(found):
     rows = [["world", "method", "episodes"]]
     for optimizer in OPTIMIZERS:
         rows[0] += [f"{optimizer}: reward per step", "worst trial", "at best end"]
-    for world in WORLDS:
-        for method in METHODS:
+    worlds, methods = results.named_in(found)
+    for world in worlds:
+        for method in methods:
             pair = [found.get((world, method, optimizer)) for optimizer in OPTIMIZERS]
             if any(pair):
                 lengths = ", ".join(sorted({str(result.num_episodes) for result in pair if result}))
-                rows.append([world, METHODS[method], lengths, *(word for result in pair for word in scores(world, result))])
-        if rows[-1][0] == world:
+                words = [word for result in pair for word in scores(world, result)]
+                rows.append([Path(world).stem, name_of(method), lengths, *words])
+        if rows[-1][0] == Path(world).stem and np.isfinite(statistics.optimum(world)):
             best = f"*{statistics.optimum(world):.2f}*"
-            rows.append([world, "*exact optimum*", "", best, "", "", best, "", ""])
+            rows.append([Path(world).stem, "*exact optimum*", "", best, "", "", best, "", ""])
     return rows
 
 
@@ -79,7 +81,8 @@ def cell_table(found):
     rows = [["world", "method", "optimiser", "episodes", "minutes", "commit"]]
     for (world, method, optimizer), result in found.items():
         minutes = "" if np.isnan(result.seconds) else f"{result.seconds / 60:.1f}"
-        rows.append([world, METHODS[method], optimizer, str(result.num_episodes), minutes, result.about.get("commit", "")[:10]])
+        who, commit = [Path(world).stem, name_of(method), optimizer], result.about.get("commit", "")[:10]
+        rows.append([*who, str(result.num_episodes), minutes, commit])
     return rows
 
 
@@ -90,7 +93,7 @@ def settings_table():
         tuned = script(method).TUNED
         for world in WORLDS:
             chosen = [tuned.get((world, optimizer), {}) for optimizer in OPTIMIZERS]
-            rows.append([METHODS[method], world, *(", ".join(f"{k} {v:g}" for k, v in numbers.items()) for numbers in chosen)])
+            rows.append([name_of(method), world, *(", ".join(f"{k} {v:g}" for k, v in numbers.items()) for numbers in chosen)])
     return rows
 
 
@@ -111,7 +114,9 @@ def whole_comparison_hours(found, cores=2):
 def all_figures(found):
     """{name: figure} of what can be drawn from the results."""
     drawn = {}
+    others = results.named_in(found)[1][len(METHODS) :]
     for name, methods in figures.FIGURES.items():
+        methods = (*methods, *others)
         own = [method for method in methods if method not in ("pg", "espg", "decespg")]
         if any(method in own for _, method, _ in found):
             drawn[name] = figures.learning_curves(found, methods)
@@ -167,7 +172,7 @@ def team_films(found, methods=("pg", "decespg"), optimizer="sign", longest=200):
             world = envs.make_world(world_name)
             states = figures.episode_states(world, result.actions[:longest])
             frames = [envs.draw(world, state, cell=32, caption=f"step {t}") for t, state in enumerate(states)]
-            words = f"{METHODS[method]} in {world_name}, {len(result.actions)} steps"
+            words = f"{name_of(method)} in {world_name}, {len(result.actions)} steps"
             with tempfile.TemporaryDirectory() as folder:
                 envs.save_gif(film := Path(folder) / "team.gif", frames)
                 films.append(f"<figure>{embedded('gif', film.read_bytes(), words)}<figcaption>{words}</figcaption></figure>")
@@ -209,14 +214,15 @@ def rewrite(readme, name, text):
     return f"{before}{marks[0]}\n{text}\n{marks[1]}{after}"
 
 
-def main(runs: Path = RUNS, output: Path = Path("report.html")):
+def main(runs: Path = RUNS, output: Path = Path("report.html"), scripts: tuple[Path, ...] = ()):
     """Take in new runs, redraw, rewrite.
 
     Args:
         runs: where the cells have worked
         output: the page
+        scripts: files of your own methods, if they are not in algos/
     """
-    results.take_in(runs)
+    results.take_in(runs, tuple(map(str, scripts)))
     found = results.kept()
     if not found:
         print("report.py: there is no result yet; ./benchmark.sh makes some.", file=sys.stderr)

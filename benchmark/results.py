@@ -3,14 +3,14 @@
 import json
 import sys
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, WORLDS, Cell, script, settings_of
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, WORLDS, Cell, path_of, script, settings_of
+from envs import run
 
 STORE = ROOT / "benchmark" / "results"
 BLOCK = 100  # episodes of which a point of a curve is the mean
@@ -30,11 +30,10 @@ class Result:
     about: dict  # args.json but for what does not concern the result, such as directories
 
     @classmethod
-    def of_run(cls, run_dir):
-        """Read a finished run's directory."""
+    def of_run(cls, run_dir, method=None):
+        """Read a finished run's directory; method: its script, unless it is one of algos/."""
         about = json.loads((run_dir / "args.json").read_text())
-        housekeeping = script(about["method"]).HOUSEKEEPING
-        about["args"] = {name: value for name, value in about["args"].items() if name not in housekeeping}
+        about["args"] = {name: value for name, value in about["args"].items() if name not in run.HOUSEKEEPING}
         world = envs.make_world(about["args"]["env"])
         with np.load(run_dir / "episodes.npz") as episodes:
             log = envs.EpisodeLog(world, *episodes["returns"].shape)
@@ -51,7 +50,7 @@ class Result:
             at_best=block_means(log.outcomes == (world.best_outcome if world.outcome_names else -1)),
             last=log.means(recent)["reward_per_step"],
             usual=log.usual_outcomes(recent),
-            actions=sample_episode(about["method"], run_dir / "policy.pt", world.num_agents),
+            actions=sample_episode(method or about["method"], run_dir / "policy.pt", world.num_agents),
             seconds=float(timed.read_text()) if timed.exists() else float("nan"),
             num_episodes=num_episodes,
             about=about,
@@ -76,12 +75,11 @@ def sample_episode(method, policy_file, num_agents):
     """The joint actions [T, num_agents] of an episode that the first team of a policy.pt plays; T is 0 if there is no file."""
     if not policy_file.exists():
         return np.zeros((0, num_agents), np.int8)
-    module = script(method)
-    env, policy = module.load_teams(policy_file)
-    alone, rollout = envs.GridVectorEnv(env.world, 1), module.Rollout(envs.GridVectorEnv(env.world, 1))
-    uniforms = np.random.default_rng(1).random((1, env.world.max_steps, num_agents))
-    module.collect(alone, policy.subset(np.arange(num_agents)), uniforms, rollout)
-    return rollout.actions[: rollout.lengths[0], 0].astype(np.int8)
+    _, world, team = run.load(policy_file, script(method))
+    rollout = envs.Rollout(world, 1, head=getattr(team.policy, "head", envs.softmax))
+    first = [param[:num_agents] for param in team.policy.params]
+    rollout.play(first, [np.random.default_rng(1)], getattr(team.policy, "parameter", 1.0))
+    return rollout.actions[:, 0].astype(np.int8)
 
 
 def load(path):
@@ -93,33 +91,55 @@ def load(path):
         return None
 
 
-def take_in(runs):
-    """Keep the finished cells of the comparison that lie under `runs` and are not shorter than what is kept already."""
+def take_in(runs, scripts=()):
+    """Keep the finished cells of the comparison that lie under `runs` and are not shorter than what is kept already.
+
+    scripts: files of methods outside algos/
+    """
+    methods = {path_of(method).stem: method for method in (*(path.stem for path in (ROOT / "algos").glob("*.py")), *scripts)}
     for file in sorted(runs.rglob("episodes.npz")):
         try:
             found = settings_of(file.parent)
         except Exception as error:  # whatever can be wrong with a file
             print(f"{file.parent} cannot be read ({type(error).__name__}) and is left out.", file=sys.stderr)
             continue
-        if (found["seed"], found["num_trials"]) != (1, 20) or found["method"] not in METHODS:
+        if (found["seed"], found["num_trials"]) != (1, 20) or found["method"] not in methods:
             continue
-        cell = Cell(found["method"], found["env"], found.get("optimizer", "adam"), num_episodes=found["num_episodes"])
-        if cell.settings != found:  # somebody's own experiment, or from before a change of the defaults
+        method, optimizer = methods[found["method"]], found.get("optimizer", "adam")
+        try:
+            cell = Cell(method, found["env"], optimizer, num_episodes=found["num_episodes"])
+            own = cell.settings == found  # not somebody's experiment, nor from before a change of the defaults
+        except envs.UsageError as error:  # a world that is there no more
+            print(f"{file.parent} is left out: {error}", file=sys.stderr)
+            continue
+        if not own:
             continue
         if broken := cell.what_is_wrong(file.parent):
             print(f"{broken} and is left out.", file=sys.stderr)
             continue
-        path = STORE / cell.world / f"{cell.method}-{cell.optimizer}.npz"
+        path = STORE / Path(cell.world).stem / f"{found['method']}-{optimizer}.npz"
         before = load(path)
         if before is None or before.num_episodes <= cell.settings["num_episodes"]:
-            Result.of_run(file.parent).save(path)
+            Result.of_run(file.parent, method).save(path)
 
 
 def kept():
-    """All results that are kept, {(world, method, optimizer): Result}."""
-    keys = product(WORLDS, METHODS, OPTIMIZERS)
-    found = {(world, method, optimizer): load(STORE / world / f"{method}-{optimizer}.npz") for world, method, optimizer in keys}
-    return {key: result for key, result in found.items() if result is not None}
+    """All results that are kept, {(world, method, optimizer): Result}, in the order of the tables; others come last."""
+    found = {}
+    for result in filter(None, map(load, sorted(STORE.rglob("*.npz")))):
+        args = result.about["args"]
+        found[args["env"], result.about["method"], args.get("optimizer", "adam")] = result
+
+    def place(key):
+        orders = list(WORLDS), list(METHODS), list(OPTIMIZERS)
+        return [order.index(word) if word in order else len(order) for order, word in zip(orders, key, strict=True)]
+
+    return {key: found[key] for key in sorted(found, key=place)}
+
+
+def named_in(found):
+    """The worlds and the methods of results: the paper's, and whatever others there are."""
+    return [list(dict.fromkeys((*own, *(key[place] for key in found)))) for place, own in ((0, WORLDS), (1, METHODS))]
 
 
 def seconds_per_episode(results):
@@ -138,7 +158,7 @@ def seconds_per_episode(results):
         both = [world for world in WORLDS if {(method, world), ("pg", world)} <= set(known)]
         return float(np.mean([known[method, world] / known["pg", world] for world in both])) if both else 1.0
 
-    pace = {}
+    pace = dict(known)
     for world in WORLDS:
         by_others = [known[method, world] / ratio_to_pg(method) for method in METHODS if (method, world) in known]
         pg = known.get(("pg", world), float(np.mean(by_others)) if by_others else 0.01)

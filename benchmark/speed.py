@@ -29,6 +29,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 
 EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
+EARLY = {"findtreasure": 200, "pushbox": 200, "gotogether": 20}  # in which teams still explore
 NOVELTIES = ("decespg_ex2", "espg_icm", "espg_emi")  # DecESPG or ESPG with another exploration bonus
 
 
@@ -99,51 +100,28 @@ def bonus_speed(window, visits=20_000):
     return (time.process_time() - start) / (visits * world.num_agents) * 1e6
 
 
-def matrix_speed(size=1024, repeats=10):
-    """Billions of arithmetic operations per second of a large single-precision matrix product: the limit of one core."""
-    matrix = torch.ones(size, size)
-    matrix @ matrix
-    start = time.process_time()
-    for _ in range(repeats):
-        matrix @ matrix
-    return repeats * 2 * size**3 / (time.process_time() - start) / 1e9
-
-
 def update_profile(method, env, num_episodes=200):
-    """Shares of a run's time that acting, the update and its backward pass take, and the update's arithmetic per second.
-
-    The update is the policies' forward and backward pass over all observations of an episode (and of the memory); for every
-    weight and observation that is 2 operations forward and 4 backward.
-    """
+    """Shares of a run's time that play, the networks' forward and backward pass and the optimiser take."""
     script = importlib.import_module(f"algos.{method}")
-    seconds, state = dict(acting=0.0, forward=0.0, backward=0.0), dict(collecting=False, operations=0)
-    collect, act, grad = script.collect, script.StackedMLP.__call__, torch.autograd.grad
+    seconds = dict.fromkeys(("play", "forward", "backward", "optimiser"), 0.0)
 
-    def timed(what, function, *args):
-        start = time.process_time()
-        result = function(*args)
-        seconds[what] += time.process_time() - start
-        return result
+    def timed(what, function):
+        def call(*args, **options):
+            start = time.process_time()
+            result = function(*args, **options)
+            seconds[what] += time.process_time() - start
+            return result
 
-    def watched_collect(*args):
-        state["collecting"] = True
-        collect(*args)
-        state["collecting"] = False
-
-    def watched_act(self, x):
-        if not state["collecting"]:
-            state["operations"] += 6 * x.shape[1] * sum(param.numel() for param in self.params)
-        return timed("acting" if state["collecting"] else "forward", act, self, x)
+        return call
 
     with (
-        patch.object(script, "collect", watched_collect),
-        patch.object(script.StackedMLP, "__call__", watched_act),
-        patch.object(torch.autograd, "grad", lambda *args: timed("backward", grad, *args)),
+        patch.object(envs.Rollout, "play", timed("play", envs.Rollout.play)),
+        patch.object(script.StackedMLP, "__call__", timed("forward", script.StackedMLP.__call__)),
+        patch.object(torch.Tensor, "backward", timed("backward", torch.Tensor.backward)),
+        patch.object(torch.optim.Adam, "step", timed("optimiser", torch.optim.Adam.step)),
     ):
         total, _ = script_speed(method, env, 20, num_episodes)
-    update = seconds["forward"] + seconds["backward"]
-    shares = [f"{part / total:.0%}" for part in (seconds["acting"], seconds["forward"], seconds["backward"])]
-    return [*shares, f"{state['operations'] / update / 1e9:.0f}"]
+    return [f"{part / total:.0%}" for part in seconds.values()]
 
 
 def startup_seconds(method):
@@ -169,16 +147,31 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
     rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
     print_table("Million environment steps per second:", ["copies of", *copies], rows)
 
-    rows, seconds, rates = [], {}, {}
+    rows = [[env, n, f"{script_speed('pg', env, 20, n)[1]:.0f}"] for env, n in EARLY.items()]
+    print_table(
+        "PG, useful environment steps per second of 20 trials in the first episodes:", ["world", "episodes", "steps/s"], rows
+    )
+
+    rows, rates = [], {}
     for method in methods:
         for env, episodes in EPISODES.items():
             episodes //= 10 if quick else 1
             one, one_rate = script_speed(method, env, 1, episodes)
             many, many_rate = script_speed(method, env, 20, episodes)
-            seconds[method, env], rates[method, env] = many, many_rate
+            rates[method, env] = many_rate
             rows.append([method, env, episodes, f"{one:.0f}", f"{one_rate:.0f}", f"{many:.0f}", f"{many_rate:.0f}"])
-            rows[-1] += [f"{many_rate / one_rate:.1f}", f"{many / seconds['pg', env]:.2f}"]
-    head = ["script", "world", "episodes", "1 trial: s", "steps/s", "20 trials: s", "steps/s", "20 : 1 trials", "time : pg"]
+            rows[-1] += [f"{many_rate / one_rate:.1f}", f"{rates['pg', env] / many_rate:.2f}"]
+    head = [
+        "script",
+        "world",
+        "episodes",
+        "1 trial: s",
+        "steps/s",
+        "20 trials: s",
+        "steps/s",
+        "20 : 1 trials",
+        "time per step : pg",
+    ]
     print_table("Training, useful environment steps per second:", head, rows)
 
     rows = []
@@ -193,8 +186,8 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
     shares = [[env, f"{rates['decespg', env] * 2 * visit[50] / 1e6:.0%}"] for env in EPISODES]  # two agents remember each step
     print_table("Its share of DecESPG's time at 20 trials:", ["world", "share"], shares)
     rows = [[method, env, *update_profile(method, env)] for method in ("pg", "decespg") for env in ("cleaner", "movebox")]
-    head = ["script", "world", "acting", "forward", "backward", "update, GFLOP/s"]
-    print_table(f"The 256-128 networks (a large matrix product: {matrix_speed():.0f} GFLOP/s):", head, rows)
+    head = ["script", "world", "play", "forward", "backward", "optimiser"]
+    print_table("Where the time of the 256-128 networks goes, 20 trials:", head, rows)
     rows = [[method, f"{startup_seconds(method):.1f}"] for method in methods]
     print_table("Start-up, with two episodes:", ["script", "seconds"], rows)
 

@@ -6,8 +6,8 @@
     print(envs.optimum("findtreasure"))                  # the exact optimum, by search
     envs.draw(world, world.start)                        # a picture; envs.save_gif makes a film of several
 
-`envs.WORLDS` has the worlds by name; each one's module is its documentation. Wherever a name is asked for, a file with a world of
-your own will do: `python -m envs my_world.py` plays it in a terminal, as `python -m envs pushbox` does.
+`envs.WORLDS` has the worlds by name; each one's module is its documentation. Wherever a name is asked for, a file with a world
+of your own will do: `python -m envs my_world.py` plays it in a terminal, as `python -m envs pushbox` does.
 """
 
 from envs.base import PositionWorld, UsageError, World, check_choice, check_number, check_whole, kernel, rule

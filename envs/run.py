@@ -357,7 +357,7 @@ class Run:
 
 def is_ours(name):
     """Whether a run, or ./benchmark.sh beside it, may have written a file of this name."""
-    return name.startswith((".", "seed")) or name in (*OUTPUT, "output.txt", "exit_code")
+    return name.startswith((".", "seed")) or name in (*OUTPUT, "output.txt", "exit_code", "seconds")
 
 
 @contextlib.contextmanager

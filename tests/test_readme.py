@@ -1,4 +1,4 @@
-"""The commands of README and docs/ and the worked example do what they say."""
+"""The commands and examples of README and docs/ do what they say."""
 
 import re
 import shlex
@@ -16,16 +16,31 @@ BLOCKS = [block for text in TEXTS for block in re.findall(r"```(bash|python)\n(.
 COMMANDS = [line for kind, block in BLOCKS if kind == "bash" for line in block.splitlines()]
 
 
-def run(command, folder):
-    words = [str(ROOT / word) if word.startswith("algos/") else word for word in shlex.split(command)]
-    done = subprocess.run([sys.executable, *words[1:]], cwd=folder, capture_output=True, text=True)
+def example(words):
+    """The one Python example with these words."""
+    (found,) = [block for kind, block in BLOCKS if kind == "python" and words in block]
+    return found
+
+
+def python(folder, *words):
+    """Run the Python of the tests in a folder, with the repository's envs and algos at hand; returns what it says."""
+    done = subprocess.run([sys.executable, *map(str, words)], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+def run(command, folder):
+    words = [str(ROOT / word) if word.startswith("algos/") else word for word in shlex.split(command)]
+    return python(folder, *words[1:])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("user")
+    """A user's folder in which `import envs` and `import algos` work."""
+    folder = tmp_path_factory.mktemp("user")
+    for name in ("envs", "algos", "benchmark"):
+        (folder / name).symlink_to(ROOT / name)
+    return folder
 
 
 def test_ci_runs_exactly_the_test_command():
@@ -41,7 +56,8 @@ def test_the_first_command_installs_and_trains(folder):
 
 
 def test_the_example_commands_run(folder):
-    train, evaluate, other, help_text, *reported = [command for command in COMMANDS if command.startswith("python algos/")]
+    commands = [command for command in COMMANDS if command.startswith("python algos/") and "my_world" not in command]
+    train, evaluate, other, help_text, *reported = commands
     policy = evaluate.split()[-1]
     assert "20 trials" in run(f"{train} --num-episodes 2 --run-dir {policy.rpartition('/')[0]}", folder)
     assert "2 episodes of 20 teams" in run(f"{evaluate} --num-episodes 2", folder)
@@ -51,23 +67,79 @@ def test_the_example_commands_run(folder):
         assert "usual end" in run(re.sub("--num-episodes [0-9]+", "--num-episodes 2", command), folder)
 
 
-def test_the_worked_example_replaces_the_bonus(folder):
-    example = next(block for kind, block in BLOCKS if kind == "python" and "class VisitNovelty" in block)
+def test_the_shown_numbers_of_changed_lines_are_those_of_diff():
+    rows = re.findall(r"^\| (\w+) \| (\w+) \| (\d+) / (\d+) \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(rows) >= 8
+    for one, other, gone, new in rows:
+        words = ["diff", f"algos/{one}.py", f"algos/{other}.py"]
+        lines = subprocess.run(words, cwd=ROOT, capture_output=True, text=True).stdout.splitlines()
+        counts = [sum(line.startswith(sign) for line in lines) for sign in "<>"]
+        assert counts == [int(gone), int(new)], (one, other)
+
+
+def test_looking_inside_a_trained_team(folder):
+    words = ["--env", "pushbox", "--seed", 3, "--num-episodes", 400, "--save-model", "--run-dir", "runs/pushbox/decespg/seed3"]
+    python(folder, ROOT / "algos" / "decespg.py", *words, "--overwrite")
+    code = example("envs.run.load(")
+    assert len(code.splitlines()) <= 13
+    said = python(folder, "-c", code + "\nprint(probs.sum(1).tolist(), bonus.shape, (bonus >= 0).all(), best.shape[1])")
+    sums, shape, positive, agents = re.match(r"(\[.*\]) (\(.*\)) (\w+) (\d)", said).groups()
+    assert [round(total, 5) for total in eval(sums)] == [1, 1]
+    assert (shape, positive, agents) == ("(2, 4)", "True", "2")
+
+
+# --- docs/own.md ---
+
+
+def test_the_example_of_a_world_works_wherever_a_name_does(folder):
+    world = example("class Corridor")
+    assert len(world.splitlines()) <= 45
+    (folder / "my_world.py").write_text(world)
+    play, optimum, decespg, pg, compare = [command for command in COMMANDS if "my_world.py" in command]
+    assert "B bell" in (said := run(play, folder)).replace("b bell", "B bell")
+    assert re.search(r"end: (far end|near end|time limit) after \d+ steps", said)
+    assert re.search(r"far end +6 +10 ", run(optimum, folder))
+    assert "3 trials, usual end: " in run(decespg.replace("500", "20"), folder)
+    assert list(folder.glob("runs/my_world/decespg/*/team.gif"))
+    assert "1 trial, usual end: " in run(f"{pg} --num-episodes 20", folder)
+    words = shlex.split(compare)[1:]
+    words = [word.replace("500", "4") if word == "500" else word for word in words]
+    said = python(ROOT, "-m", "benchmark.compare", *(str(folder / w) if w == "my_world.py" else w for w in words), "--dry-run")
+    assert "my_world/pg/sign-seeds1-3-episodes4" in said
+    assert "my_world/decespg/sign-seeds1-3-episodes4" in said
+
+
+@pytest.mark.parametrize("policy", ["SharedPolicy(init, world, args.hidden)", "GRUPolicy(init, world)"])
+def test_other_networks_train_are_saved_and_play(policy, folder, tmp_path):
+    name = policy.partition("(")[0]
+    changed = (ROOT / "algos" / "pg.py").read_text().replace("def build(", example(f"class {name}") + "\n\ndef build(", 1)
+    made = "StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])"
+    changes = {made: policy, "rollout.play(team.policy.params, act)": "rollout.play_with(team.policy.player(), act)"}
+    if name == "GRUPolicy":
+        changes["        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)\n"] = ""
+        changes["rollout.of_taken(log_probs)"] = "team.policy.log_probs(rollout)"
+    for old, new in changes.items():
+        assert changed.count(old) == 1
+        changed = changed.replace(old, new)
+    (tmp_path / "algos").mkdir()
+    (tmp_path / "algos" / "mine.py").write_text(changed)
+    (tmp_path / "envs").symlink_to(ROOT / "envs")
+    words = ["--env", "findtreasure", "--max-steps", 30, "--num-trials", 2, "--num-episodes", 30, "--save-model"]
+    said = python(tmp_path, "algos/mine.py", *words, "--run-dir", "run", "--optimizer", "adam")
+    assert "2 trials, usual end: " in said
+    assert "5 episodes of 2 teams" in python(tmp_path, "algos/mine.py", "--evaluate", "run/policy.pt", "--num-episodes", 5)
+
+
+def test_the_example_of_a_bonus_takes_the_place_of_the_window(folder, tmp_path):
+    bonus = example("class VisitNovelty")
     script = (ROOT / "algos" / "decespg.py").read_text()
-    changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: example + "\n\n", script, flags=re.DOTALL)
+    changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: bonus + "\n\n", script, flags=re.DOTALL)
     changed = changed.replace("import numpy as np\n", "from collections import defaultdict\n\nimport numpy as np\n", 1)
     assert changed.count("class VisitNovelty") == 1
-    assert "visit_counts(pairs" not in changed.replace("def visit_counts(pairs", "")
-    (folder / "algos").mkdir()
-    (folder / "algos" / "counts.py").write_text(changed)
-    (folder / "envs").symlink_to(ROOT / "envs")
+    (tmp_path / "algos").mkdir()
+    (tmp_path / "algos" / "counts.py").write_text(changed)
+    (tmp_path / "envs").symlink_to(ROOT / "envs")
     train = "import sys; sys.path.insert(0, 'algos'); import counts; run = counts.train(counts.Args(num_episodes=30));"
-    said = subprocess.run(
-        [sys.executable, "-c", train + "print(sum(run.novelty.counts.values()), 2 * run.log.lengths.sum())"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-    )
-    assert said.returncode == 0, said.stderr
-    remembered, steps = map(int, said.stdout.splitlines()[-1].split())
+    said = python(tmp_path, "-c", train + "print(sum(run.novelty.counts.values()), 2 * run.log.lengths.sum())")
+    remembered, steps = map(int, said.splitlines()[-1].split())
     assert remembered == steps > 60
