@@ -23,9 +23,7 @@ def find_cache():
     except RuntimeError:
         numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="envs-")
         atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)
-        print(
-            "Compiled code cannot be kept here, so each start compiles anew; NUMBA_CACHE_DIR names a place.", file=sys.stderr
-        )
+        print("Compiled code cannot be kept here, so each start compiles anew; NUMBA_CACHE_DIR names a place.", file=sys.stderr)
 
 
 find_cache()

@@ -33,6 +33,7 @@ each_script = pytest.mark.parametrize("name", SCRIPTS)
 each_setting = pytest.mark.parametrize(
     ("env", "optimizer"), list(itertools.product(("findtreasure", "pushbox"), ("sign", "adam")))
 )
+RACE = Path(__file__).parent / "data" / "race.py"  # a world of the user's own
 RECORDED = json.loads((Path(__file__).parent / "data" / "trajectories.json").read_text())
 # The shortest way to the best outcome, a list of joint actions; of cleaner, which has no outcomes, its constructed plan.
 BEST_PLANS = {
@@ -359,3 +360,27 @@ def contents(directory):
     """Everything that lies in a directory but for what says who owns it: {path: bytes}, None for a directory."""
     found = [path for path in directory.rglob("*") if path.name != ".owner"]
     return {path.relative_to(directory): path.read_bytes() if path.is_file() else None for path in found}
+
+
+def record_all_updates(module, monkeypatch):
+    """As `record_updates`, but of all networks that the script moves, in the order in which it does."""
+    updates, update, rollouts = [], module.update, record_rollouts(module, monkeypatch)
+
+    def note(params, loss):
+        grads = torch.autograd.grad(loss, params, retain_graph=True)
+        updates.append(Update(rollouts[-1], [param.detach().clone() for param in params], [-grad for grad in grads]))
+
+    def watched_update(optimizer, kind, loss):
+        note(optimizer.param_groups[0]["params"], loss)
+        update(optimizer, kind, loss)
+
+    monkeypatch.setattr(module, "update", watched_update)
+    if hasattr(module, "MaskedAdam"):
+
+        class WatchedAdam(module.MaskedAdam):
+            def step(self, loss, active):
+                note(self.weights, loss)
+                super().step(loss, active)
+
+        monkeypatch.setattr(module, "MaskedAdam", WatchedAdam)
+    return updates

@@ -8,7 +8,7 @@ import torch
 
 import envs
 from algos import acer
-from tests.helpers import Update, assert_same_direction, curves, each_setting, plain_logits, record_rollouts, train, weights
+from tests.helpers import assert_same_direction, curves, each_setting, plain_logits, record_all_updates, train, weights
 
 
 def random_policy(rng, num_actions=4):
@@ -309,20 +309,6 @@ def test_every_kept_episode_is_drawn_equally_often():
 # --- whole runs ---
 
 
-def record_all_updates(monkeypatch):
-    """A list that gets every update that the script makes from now on, of the policies and of the critics in turn."""
-    updates, update, rollouts = [], acer.update, record_rollouts(acer, monkeypatch)
-
-    def watched_update(optimizer, kind, loss):
-        params = optimizer.param_groups[0]["params"]
-        grads = torch.autograd.grad(loss, params, retain_graph=True)
-        updates.append(Update(rollouts[-1], [param.detach().clone() for param in params], [-grad for grad in grads]))
-        update(optimizer, kind, loss)
-
-    monkeypatch.setattr(acer, "update", watched_update)
-    return updates
-
-
 def plain_update(steps, cut, params, q_params, average, net, numbers):
     """What one agent learns from an episode, step by step in double precision.
 
@@ -354,7 +340,7 @@ def plain_update(steps, cut, params, q_params, average, net, numbers):
 @each_setting
 def test_every_update_is_that_of_the_equations(env, optimizer, tmp_path, monkeypatch):
     """12 episodes of the script, two updates after each, against equations 5 and 9-12 written out for one step at a time."""
-    updates = record_all_updates(monkeypatch)
+    updates = record_all_updates(acer, monkeypatch)
     seed, trials, num_episodes, size, decay, rates = 6, 2, 12, 40, 0.7, (0.02, 0.01)
     numbers = gamma, truncation, delta, entropy = 0.9, 1.1, 0.3, 0.03
     result = train(

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmark import compare
+from benchmark import compare, figures, report, results
 from benchmark.cells import ROOT, Cell, select
 from tests.helpers import assert_one_sentence, script
 
@@ -176,6 +176,23 @@ def test_other_settings_are_another_directory(cell, monkeypatch):
     monkeypatch.setitem(script("pg").TUNED, ("pushbox", "sign"), dict(learning_rate=0.5))  # a change of the defaults
     assert dataclasses.replace(cell).run_dir != cell.run_dir
     assert dataclasses.replace(cell).name == cell.name
+
+
+def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, capsys):
+    text = (ROOT / "algos" / "pg.py").read_text()
+    (tmp_path / "mine.py").write_text(text.replace("str(Path(__file__).resolve().parents[1])", repr(str(ROOT))))
+    world = ROOT / "tests" / "data" / "race.py"
+    store, words = tmp_path / "store", ["--algos", tmp_path / "mine.py", "--envs", world, "--optimizers", "sign"]
+    monkeypatch.setattr(results, "STORE", store)
+    code, said, _ = command(monkeypatch, capsys, *words, "--episodes", 100, "--runs", tmp_path / "runs")
+    assert (code, "1 finished, 0 failed" in said) == (0, True), said
+    results.take_in(tmp_path / "runs", [str(tmp_path / "mine.py")])
+    kept = results.kept()
+    assert list(kept) == [(str(world), "mine", "sign")]
+    assert kept[str(world), "mine", "sign"].actions.any()
+    assert [row[:3] for row in report.score_table(kept)][1] == ["race", "mine", "100"]
+    drawn = figures.learning_curves(kept, results.named_in(kept)[1])
+    assert [axis.get_title() for axis in drawn.axes] == ["race, sign", "race, adam"]
 
 
 def test_a_selection_is_a_numbered_list():

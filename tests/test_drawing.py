@@ -6,7 +6,7 @@ from PIL import Image, ImageColor
 
 import envs
 from envs.drawing import AGENTS, BOXES, CELLS
-from tests.helpers import assert_refused
+from tests.helpers import RACE, assert_refused
 
 TREASURE, PUSHBOX = envs.make_world("findtreasure"), envs.make_world("pushbox")
 FLOOR = "#ffffff"
@@ -44,6 +44,19 @@ def test_the_map_of_findtreasure(cell):
 def test_an_open_door_looks_open():
     closed, opened = (envs.draw(TREASURE, state) for state in ([4, 4, 5, 1], [4, 4, 5, 5]))
     assert (pixels(closed, CELLS["open door"]), pixels(opened, CELLS["open door"]) > 1000) == (0, True)
+
+
+def test_a_world_of_ones_own_has_colours_and_letters_of_its_own():
+    world = envs.make_world(str(RACE))
+    picture = envs.draw(world, world.start)
+    assert (middle(picture, 0, 0), middle(picture, 1, 0), middle(picture, 2, 2)) == (*AGENTS[:2], FLOOR)
+    colours = {middle(picture, row, 4) for row in range(5)}
+    assert len(colours) == 1
+    assert not colours & {FLOOR, *CELLS.values(), *BOXES.values()}
+    env = envs.make(str(RACE), render_mode="ansi", size=3)
+    env.reset()
+    frame = "+------+"
+    assert env.render().splitlines() == [frame, "|0   ff|", "|1   ff|", "|    ff|", frame, "0 1 agents, f finish"]
 
 
 @pytest.mark.parametrize("cell", [12, 48, 96])

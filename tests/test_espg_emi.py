@@ -1,7 +1,5 @@
 """ESPG with EMI: its loss against closed forms, a known world and plain formulas; every update; learning."""
 
-import os
-import signal
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +18,7 @@ from tests.helpers import (
     memory_steps,
     plain_logits,
     plain_returns,
-    record_updates,
+    record_all_updates,
     train,
     use_double_precision,
 )
@@ -166,13 +164,11 @@ def plain_logits_of(own, parts):
     return ((x @ own[0] + own[1][0]).clamp(min=0) @ own[2] + own[3][0])[0]
 
 
-def own_model(embeddings, statistics, k):
-    """Trial k's weights of all five networks."""
-    parts = [param[k].double().requires_grad_() for param in embeddings.params]
-    models = dict(phi=parts[:4], psi=parts[4:8], S=parts[8:])
-    for which, net in enumerate(("T_a", "T_o")):
-        models[net] = [param[2 * k + which].double().requires_grad_() for param in statistics.params]
-    return models
+def own_model(params, k):
+    """Trial k's part of the model's weights, or of their gradients: those of all five networks."""
+    parts = [param[k].double() for param in params[:12]]
+    both = [[param[2 * k + which].double() for param in params[12:]] for which in range(2)]
+    return dict(phi=parts[:4], psi=parts[4:8], S=parts[8:], T_a=both[0], T_o=both[1])
 
 
 WORLDS = {
@@ -186,24 +182,24 @@ WORLDS = {
 def test_every_update_of_the_model_and_the_actors(world, tmp_path, monkeypatch):
     """10 episodes: the bonus with the model before them, what the model learns from, and what the actors climb."""
     use_double_precision(espg_emi, monkeypatch)
-    updates = record_updates(espg_emi, monkeypatch)
+    updates = record_all_updates(espg_emi, monkeypatch)
     args, agents = WORLDS[world]
     args = dict(args, seed=3, num_trials=3, num_episodes=10, max_steps=36, learning_rate=0.02, gamma=0.9, log_every=1)
     model_args = dict(embedding_batch=25, recent_steps=31, error_weight=0.5, information_weight=0.7, gaussian_weight=0.3)
     log = train(espg_emi, tmp_path, **args, **model_args, embedding_learning_rate=0.05, beta=1.7, slots=2).log
-    assert len(updates) == 30
+    assert len(updates) == 20
     num_actions = log.world.num_actions
     learn = [np.random.default_rng(np.random.SeedSequence(3 + k).spawn(3)[2]) for k in range(3)]
     shown = [curves(tmp_path / f"seed{3 + k}") for k in range(3)]
     visits, held, kept = [0] * 3, [{} for _ in range(3)], [{} for _ in range(3)]
     waited, overflowed = 0, 0
-    episodes = list(zip(updates[::3], updates[1::3], updates[2::3], strict=True))
-    for n, (embeddings, statistics, actors) in enumerate(episodes):
+    episodes = list(zip(updates[::2], updates[1::2], strict=True))
+    for n, (model, actors) in enumerate(episodes):
         rollout, steps_of = actors.rollout, []
         for k, length in enumerate(rollout.lengths):
-            obs, actions, reward = rollout.obs[: length + 1, k], rollout.actions[:length, k], rollout.reward[:length, k]
+            obs, actions, reward = rollout.all_obs[: length + 1, k], rollout.actions[:length, k], rollout.reward[:length, k, 0]
             steps = [(obs[t], actions[t], obs[t + 1]) for t in range(length)]
-            own = own_model(embeddings, statistics, k)
+            own = own_model(model.params, k)
 
             # The bonus.
             phi, psi, next_phi, error = (part.detach().numpy() for part in plain_parts(own, steps, num_actions))
@@ -216,21 +212,19 @@ def test_every_update_of_the_model_and_the_actors(world, tmp_path, monkeypatch):
             batch = [held[k][row] for row in learn[k].integers(min(visits[k], 31), size=25)]
             overflowed += length > 31
             if visits[k] >= 25:
+                params = [param.requires_grad_() for part in own.values() for param in part]
                 loss, figures = plain_loss(own, batch, num_actions, model_args)
-                params = [param for part in own.values() for param in part]
-                expected = torch.autograd.grad(loss, params)
-                found = [grad[k] for grad in embeddings.direction]
-                found += [grad[2 * k + which] for which in range(2) for grad in statistics.direction]
-                for direction, grad in zip(found, expected, strict=True):
+                found = [direction for part in own_model(model.direction, k).values() for direction in part]
+                for direction, grad in zip(found, torch.autograd.grad(loss, params), strict=True):
                     assert np.allclose(-direction, grad, rtol=1e-7, atol=1e-9 * max(1.0, float(grad.abs().max())))
                 for tag, value in zip(("unexplained", "information"), figures, strict=True):
-                    assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(value, rel=1e-5, abs=1e-6))
+                    assert shown[k][f"charts/{tag}"][n][1] == pytest.approx(value, rel=1e-5, abs=1e-6)
             if n < 9:  # who has not seen enough waits
-                following = own_model(*episodes[n + 1][:2], k)
+                following = own_model(episodes[n + 1][0].params, k)
                 same = [torch.equal(p, q) for net in own for p, q in zip(own[net], following[net], strict=True)]
                 assert all(same) if visits[k] < 25 else not any(same)
                 waited += visits[k] < 25
-            assert shown[k]["charts/bonus"][n] == (n + 1, pytest.approx(bonus.mean(), rel=1e-5))
+            assert shown[k]["charts/bonus"][n][1] == pytest.approx(bonus.mean(), rel=1e-5)
 
             # What the actors climb.
             best = kept[k].setdefault(int(rollout.outcomes[k]), [])
@@ -253,11 +247,11 @@ def test_every_update_of_the_model_and_the_actors(world, tmp_path, monkeypatch):
 def test_later_the_model_learns_after_every_fifth_episode_only(tmp_path, monkeypatch):
     assert [espg_emi.learns_after(episode) for episode in range(2000)] == [True] * 1000 + [True, *[False] * 4] * 200
     monkeypatch.setattr(espg_emi, "learns_after", lambda episode: episode < 3 or episode == 6)
-    updates = record_updates(espg_emi, monkeypatch)
+    updates = record_all_updates(espg_emi, monkeypatch)
     args = dict(env="pushbox", num_trials=1, num_episodes=9, max_steps=20, log_every=1)
     model = train(espg_emi, tmp_path, **args, embedding_batch=2).novelty
-    assert len(updates) == 4 * 3 + 5  # the embeddings, the statistics and the actors, or the actors alone
-    assert model.optimizers[0].count.tolist() == [4]
+    assert len(updates) == 4 * 2 + 5  # the model and the actors, or the actors alone
+    assert model.optimizer.count.tolist() == [4]
     shown = curves(tmp_path / "seed1")
     for tag in ("unexplained", "information"):
         values = [value for _, value in shown[f"charts/{tag}"]]
@@ -267,18 +261,17 @@ def test_later_the_model_learns_after_every_fifth_episode_only(tmp_path, monkeyp
 
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_model_has_an_adam_of_its_own(optimizer, tmp_path, monkeypatch):
-    updates = record_updates(espg_emi, monkeypatch)
+    updates = record_all_updates(espg_emi, monkeypatch)
     args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=20)
     model = train(espg_emi, tmp_path, **args, embedding_batch=2, embedding_learning_rate=1e-2).novelty
-    for which, optimizer in enumerate(model.optimizers):
-        reference = [param.clone() for param in updates[which].params]
-        adam = torch.optim.Adam(reference, lr=1e-2)
-        after = [*(update.params for update in updates[which + 3 :: 3]), optimizer.params]
-        for update, following in zip(updates[which::3], after, strict=True):
-            for param, direction in zip(reference, update.direction, strict=True):
-                param.grad = -direction
-            adam.step()
-            assert all(torch.allclose(a, b, rtol=0, atol=1e-5) for a, b in zip(reference, following, strict=True))
+    reference = [param.clone() for param in updates[0].params]
+    adam = torch.optim.Adam(reference, lr=1e-2)
+    after = [*(update.params for update in updates[2::2]), model.optimizer.weights]
+    for update, following in zip(updates[::2], after, strict=True):
+        for param, direction in zip(reference, update.direction, strict=True):
+            param.grad = -direction
+        adam.step()
+        assert all(torch.allclose(a, b, rtol=0, atol=1e-5) for a, b in zip(reference, following, strict=True))
 
 
 def test_the_models_weights_are_drawn_after_the_actors(tmp_path):
@@ -307,28 +300,6 @@ def test_the_defaults_are_those_of_the_docstring():
     args = espg_emi.Args()
     assert (args.error_weight, args.information_weight, args.gaussian_weight) == (100, 0.1, 0.5)
     assert (args.embedding_batch, args.recent_steps, args.embedding_learning_rate) == (64, 4000, 0.003)
-
-
-def test_a_run_that_was_stopped_goes_on_with_its_model(tmp_path, monkeypatch):
-    args = dict(env="pushbox", num_trials=2, num_episodes=30, max_steps=40, learning_rate=1e-2, recent_steps=50)
-    whole = train(espg_emi, tmp_path / "whole", **args)
-    collect, played = espg_emi.collect, []
-
-    def interrupted(*args):
-        collect(*args)
-        played.append(None)
-        if len(played) == 18:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(espg_emi, "collect", interrupted)
-        with pytest.raises(SystemExit):
-            train(espg_emi, tmp_path / "stopped", **args)
-    resumed = train(espg_emi, tmp_path / "stopped", **args, resume=True)
-    assert_same_run(whole, resumed)
-    assert all(
-        torch.equal(*map(torch.as_tensor, both)) for both in zip(whole.novelty.state, resumed.novelty.state, strict=True)
-    )
 
 
 # --- learning ---

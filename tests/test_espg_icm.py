@@ -14,7 +14,7 @@ from tests.helpers import (
     each_setting,
     memory_steps,
     plain_returns,
-    record_updates,
+    record_all_updates,
     train,
     use_double_precision,
     weights,
@@ -26,9 +26,11 @@ LAYERS = (2, 2, 2)  # of phi, the inverse and the forward model, where each has 
 
 def module(trials, agents, obs_dim, num_actions, **sizes):
     """A curiosity module of double precision for a world with these numbers."""
-    sizes = {**dict(hidden=(7,), features=3, icm_hidden=(6,), forward_weight=0.3, learning_rate=0.01), **sizes}
+    default = dict(hidden=(7,), features=3, icm_hidden=(6,), forward_weight=0.3, icm_learning_rate=0.01)
     world = SimpleNamespace(num_agents=agents, obs_dim=obs_dim, num_actions=num_actions)
-    return espg_icm.IntrinsicCuriosity(list(map(np.random.default_rng, range(trials))), SimpleNamespace(world=world), **sizes)
+    return espg_icm.IntrinsicCuriosity(
+        list(map(np.random.default_rng, range(trials))), world, SimpleNamespace(**default | sizes)
+    )
 
 
 def bonus(icm, obs, actions, lengths, num_actions):
@@ -83,14 +85,14 @@ def test_errors_and_gradient_of_some_episodes_are_those_of_the_plain_loop(agents
     rng, trials, num_actions, steps_made = np.random.default_rng(agents), 3, 4, []
     icm = module(trials, agents, 2, num_actions)
     step = icm.optimizer.step
-    monkeypatch.setattr(icm.optimizer, "step", lambda grads: (steps_made.append(grads), step(grads)))
+    monkeypatch.setattr(icm.optimizer, "step", lambda: (steps_made.append([p.grad.clone() for p in icm.params]), step()))
     for n, lengths in enumerate(([8, 1, 5], [1, 1, 1], [2, 8, 8], [8, 8, 8])):
         steps = max(lengths)
         obs = rng.integers(-2, 3, size=(steps + 1, trials, agents, 2)) / 2  # some are equal
         actions = rng.integers(num_actions, size=(steps, trials, agents))
         for k, length in enumerate(lengths):
             obs[length + 1 :, k] = 1e3  # nothing there may count
-        before = [own_weights(icm.optimizer.params, k) for k in range(trials)]
+        before = [own_weights(icm.params, k) for k in range(trials)]
         found, inverse_loss, accuracy = bonus(icm, obs, actions, lengths, num_actions)
         assert found.shape == (steps, trials, 1)
         assert len(steps_made) == n + 1
@@ -167,7 +169,7 @@ def test_the_inverse_model_tells_the_moves_of_both_agents_and_phi_keeps_both():
 
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
 def test_every_update_of_module_and_policies(env, tmp_path, monkeypatch):
-    updates = record_updates(espg_icm, monkeypatch)
+    updates = record_all_updates(espg_icm, monkeypatch)
     trials, gamma, beta, slots, forward_weight = 2, 0.9, 0.7, 2, 0.4
     args = dict(env=env, seed=2, num_trials=trials, num_episodes=20, max_steps=10, learning_rate=0.02, log_every=1, gamma=gamma)
     sizes = dict(hidden=(9, 8), features=5, icm_hidden=(6,))
@@ -181,13 +183,13 @@ def test_every_update_of_module_and_policies(env, tmp_path, monkeypatch):
         rollout, steps_of = climbed.rollout, []
         for k, length in enumerate(rollout.lengths):
             ends.add((length < rollout.lengths.max(), rollout.outcomes[k] > 0))
-            obs, actions, reward = rollout.obs[: length + 1, k], rollout.actions[:length, k], rollout.reward[:length, k]
+            obs, actions, reward = rollout.all_obs[: length + 1, k], rollout.actions[:length, k], rollout.reward[:length, k, 0]
             own = own_weights(learnt.params, k)
             errors, loss, *figures = plain_module(own, (3, 2, 2), obs, actions, num_actions, forward_weight)
             for found, expected in zip(learnt.direction, torch.autograd.grad(-loss, own), strict=True):
                 assert np.allclose(found[k], expected, rtol=1e-4, atol=1e-6)
             for tag, value in zip(("bonus", "inverse_loss", "inverse_accuracy"), (errors.mean(), *figures), strict=True):
-                assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(value, rel=1e-4, abs=1e-6))
+                assert shown[k][f"charts/{tag}"][n][1] == pytest.approx(value, rel=1e-4, abs=1e-6)
 
             episode = obs[:-1], actions, np.array(plain_returns(reward, gamma))
             best = kept[k].setdefault(int(rollout.outcomes[k]), [])
@@ -209,20 +211,21 @@ def test_every_update_of_module_and_policies(env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_module_has_an_adam_of_its_own_of_which_the_policies_see_nothing(optimizer, tmp_path, monkeypatch):
-    updates = record_updates(espg_icm, monkeypatch)
+    updates = record_all_updates(espg_icm, monkeypatch)
     args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10)
     trained = train(espg_icm, tmp_path, **args, learning_rate=1e-3, icm_learning_rate=1e-2)
     reference = [param.clone() for param in updates[0].params]
     adam = torch.optim.Adam(reference, lr=1e-2)
-    after = [*(update.params for update in updates[2::2]), weights(trained.curiosity.optimizer)]
+    after = [*(update.params for update in updates[2::2]), weights(trained.curiosity)]
     for update, following in zip(updates[::2], after, strict=True):
         for param, direction in zip(reference, update.direction, strict=True):
             param.grad = -direction
         adam.step()
         assert all(torch.allclose(a, b, rtol=0, atol=1e-5) for a, b in zip(reference, following, strict=True))
-    own = {id(param) for param in trained.curiosity.optimizer.params}
-    assert not own & {id(param) for param in trained.policy.params}
-    assert all(param.grad is None for param in trained.policy.params)
+    assert not {*map(id, trained.curiosity.params)} & {*map(id, trained.policy.params)}
+    before, rng = [param.grad.clone() for param in trained.policy.params], np.random.default_rng(0)
+    bonus(trained.curiosity, rng.normal(size=(9, 2, 2, 5)), rng.integers(4, size=(8, 2, 2)), [8, 8], 4)
+    assert all(torch.equal(param.grad, grad) for param, grad in zip(trained.policy.params, before, strict=True))
 
 
 @each_setting
@@ -239,7 +242,7 @@ def test_the_module_has_weights_drawn_after_the_actors(tmp_path):
     espg_icm.StackedMLP(fresh, 2, [5, 64, 32, 4])
     sizes = [10, 64, 32, 32], [2 * 32, 64, 2 * 4], [32 + 2 * 4, 64, 32]
     expected = [param for one in sizes for param in espg_icm.StackedMLP(fresh, 1, one).params]
-    assert all(torch.equal(a, b) for a, b in zip(curiosity.optimizer.params, expected, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(curiosity.params, expected, strict=True))
 
 
 def test_espg_icm_leaves_the_local_optimum_of_findtreasure(tmp_path):

@@ -17,7 +17,7 @@ from tests.helpers import (
     pairs,
     plain_logits,
     plain_returns,
-    record_updates,
+    record_all_updates,
     train,
 )
 
@@ -47,11 +47,11 @@ def played(rng, lengths):
     """One random episode of each trial as a rollout; no two steps of the team are alike."""
     obs = rng.random((MAX_STEPS + 1, len(lengths), 2, 5), np.float32)
     actions = rng.integers(4, size=(MAX_STEPS, len(lengths), 2))
-    return SimpleNamespace(obs=obs, actions=actions, lengths=np.array(lengths))
+    return SimpleNamespace(all_obs=obs, actions=actions, lengths=np.array(lengths))
 
 
 def good_episodes(trials=1, size=3):
-    return gasil.GoodEpisodes(envs.make_vec("pushbox", trials, max_steps=MAX_STEPS), size)
+    return gasil.GoodEpisodes(envs.make_world("pushbox", max_steps=MAX_STEPS), trials, size)
 
 
 # --- the good episodes ---
@@ -72,7 +72,7 @@ def test_the_best_episodes_stay_whole_and_of_equals_the_newest():
         rollout, value = played(rng, rng.integers(1, MAX_STEPS + 1, 2)), rng.integers(-2, 3, 2).astype(float)
         good.remember(number, rollout, value)
         for k, length in enumerate(rollout.lengths):
-            plain[k].offer(value[k], number, (rollout.obs[:length, k].copy(), rollout.actions[:length, k].copy()))
+            plain[k].offer(value[k], number, (rollout.all_obs[:length, k].copy(), rollout.actions[:length, k].copy()))
             for slot, (kept, born, (obs, actions)) in enumerate(plain[k].kept):
                 assert (good.value[k, slot], good.number[k, slot], good.lengths[k, slot]) == (kept, born, len(actions))
                 assert np.array_equal(good.obs[k, slot, : len(actions)], obs)
@@ -102,7 +102,7 @@ def test_steps_are_drawn_uniformly_and_for_the_whole_team():
         rollout = played(rng, lengths)
         good.remember(number, rollout, np.zeros(2))
         for k, length in enumerate(lengths):
-            plain[k].offer(0, number, (rollout.obs[:length, k], rollout.actions[:length, k]))
+            plain[k].offer(0, number, (rollout.all_obs[:length, k], rollout.actions[:length, k]))
     generators = [np.random.default_rng(seed) for seed in (3, 4)]
     obs, actions = good.draw(generators, 24_000)
     assert (obs.shape, actions.shape) == ((24_000, 2, 2, 5), (24_000, 2, 2))
@@ -134,6 +134,14 @@ def exactly(*distributions):
     return obs, np.array(distributions, np.float32)
 
 
+def steps_of_a_team(states, actions):
+    """A rollout of one trial whose two agents both see these states [T, 3] and do these actions [T]."""
+    rollout = envs.Rollout(envs.make_world("pushbox"), 1)
+    rollout.obs, rollout.rows = envs.distinct_rows(states[:, None, None].repeat(2, 2), np.array([len(states)]))
+    rollout.actions = np.array(actions)[:, None, None].repeat(2, 2)
+    return rollout
+
+
 def learnt(discriminators, good, own, steps=1500):
     """D of all states and actions after learning, [num_agents, 3, 2]."""
     for _ in range(steps):
@@ -156,8 +164,7 @@ def test_tabular_discriminators_find_the_optimum(label):
 def test_who_does_as_good_episodes_do_gets_no_reward_or_a_little_less(label, reward):
     discriminators, rho = tabular(label), np.full((3, 2), 1 / 6)
     learnt(discriminators, exactly(rho, rho), exactly(rho, rho))
-    obs = np.eye(3, dtype=np.float32)[np.array([0, 1, 2, 0])][:, None, None].repeat(2, 2)
-    found = discriminators.reward(obs, np.array([0, 1, 0, 1])[:, None, None].repeat(2, 2))
+    found = discriminators.reward(steps_of_a_team(np.eye(3, dtype=np.float32)[[0, 1, 2, 0]], [0, 1, 0, 1]))
     assert found.shape == (4, 1, 2)
     assert found == pytest.approx(reward, abs=1e-3)
     assert reward == pytest.approx(0 if label == 1 else -0.0953, abs=1e-4)
@@ -169,8 +176,7 @@ def test_what_only_one_side_does_is_told_apart_within_the_clips():
     d = learnt(discriminators, exactly(good, own), exactly(own, good), 3000)
     assert np.all(d[0][good > 0] > 0.99)
     assert np.all(d[0][own > 0] < 0.01)
-    states = np.eye(3, dtype=np.float32)[[0, 1, 0, 2]][:, None, None].repeat(2, 2)
-    found = discriminators.reward(states, np.array([0, 1, 1, 0])[:, None, None].repeat(2, 2))
+    found = discriminators.reward(steps_of_a_team(np.eye(3, dtype=np.float32)[[0, 1, 0, 2]], [0, 1, 1, 0]))
     assert found[:, 0].tolist() == [[1.5, -0.5], [1.5, -0.5], [-0.5, 1.5], [-0.5, 1.5]]
 
 
@@ -219,7 +225,7 @@ def discriminator_ascent(params, net, good, own, label):
 
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
 def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch):
-    updates = record_updates(gasil, monkeypatch)
+    updates = record_all_updates(gasil, monkeypatch)
     trials, episodes, gamma, beta, lambda_im, kernel = 2, 20, 0.9, 0.7, 3.0, dict(window=5, sigma=0.9, noise=0.2)
     args = dict(env=env, seed=2, num_trials=trials, num_episodes=episodes, max_steps=10, learning_rate=0.02, log_every=1)
     args.update(gamma=gamma, beta=beta, lambda_im=lambda_im, rise=0.5, good_episodes=3, good_batch=20, good_label=0.8)
@@ -236,7 +242,7 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
         weight = lambda_im * min(1, np.exp(-6 * (1 - n / (0.5 * episodes))))
         own_steps = {}
         for k, length in enumerate(rollout.lengths):
-            obs, actions, reward = rollout.obs[:length, k], rollout.actions[:length, k], rollout.reward[:length, k]
+            obs, actions, reward = rollout.all_obs[:length, k], rollout.actions[:length, k], rollout.reward[:length, k, 0]
             ends.add(length < rollout.lengths.max())
             plain[k].offer(plain_returns(reward, gamma)[0], n, (obs, actions))
             for i in range(2):
@@ -251,17 +257,17 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
                 for found, one in zip(discriminators.direction, expected, strict=True):
                     assert np.allclose(found[2 * k + i], one, rtol=1e-4, atol=1e-6)
             for tag, value in zip(("d_good", "d_own"), np.mean(means, axis=0), strict=True):
-                assert shown[k][f"charts/{tag}"][n] == (n + 1, pytest.approx(value, abs=1e-5))
+                assert shown[k][f"charts/{tag}"][n][1] == pytest.approx(value, abs=1e-5)
         steps_of = []
         for (k, i), steps in own_steps.items():
             length, own = rollout.lengths[k], [param[2 * k + i].detach().double() for param in after]
-            now = pairs(rollout.obs[:length, k, i], rollout.actions[:length, k, i], num_actions)
+            now = pairs(rollout.all_obs[:length, k, i], rollout.actions[:length, k, i], num_actions)
             past = visited[k, i] = np.concatenate([visited.get((k, i), now[:0]), now])
             etas = [dense_eta(past, len(past) - length + t, **kernel) for t in range(length)]
             d = np.array([log_d(own, *step)[0].exp().item() for step in steps])
             r_im = np.clip(-np.log(1 - np.clip(d, 0.01, 0.99)) + np.log(0.5), -0.5, 1.5)
             rewards += list(r_im)
-            augmented = rollout.reward[:length, k] - beta * np.log(np.clip(etas, 1e-3, 1)) + weight * r_im
+            augmented = rollout.reward[:length, k, 0] - beta * np.log(np.clip(etas, 1e-3, 1)) + weight * r_im
             returns = np.array(plain_returns(augmented, gamma))
             steps_of.append([(*step, g / length) for step, g in zip(steps, returns, strict=True)])
         assert_same_direction(direction, params, steps_of)
@@ -286,7 +292,7 @@ def test_without_imitation_and_bonus_it_is_pg_bit_for_bit(env, optimizer, tmp_pa
 
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_discriminators_have_an_adam_of_their_own(optimizer, tmp_path, monkeypatch):
-    updates = record_updates(gasil, monkeypatch)
+    updates = record_all_updates(gasil, monkeypatch)
     args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10)
     trained = train(gasil, tmp_path, **args, discriminator_learning_rate=1e-2)
     steps = updates[::2]
@@ -301,7 +307,7 @@ def test_the_discriminators_have_an_adam_of_their_own(optimizer, tmp_path, monke
 
 
 def test_discriminators_of_one_agents_observation_have_weights_drawn_after_the_actors(tmp_path, monkeypatch):
-    updates = record_updates(gasil, monkeypatch)
+    updates = record_all_updates(gasil, monkeypatch)
     train(gasil, tmp_path, env="pushbox", seed=4, num_trials=2, num_episodes=1)
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (4, 5)]
     gasil.StackedMLP(fresh, 2, [5, 64, 32, 4])

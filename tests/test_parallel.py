@@ -11,12 +11,12 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
 from pettingzoo.utils.conversions import parallel_to_aec
 
 import envs
-from tests.helpers import BEST_PLANS, assert_refused, walk
+from tests.helpers import BEST_PLANS, RACE, assert_refused, walk
 
 each_world = pytest.mark.parametrize("name", envs.WORLDS)
 
 
-@each_world
+@pytest.mark.parametrize("name", [*envs.WORLDS, str(RACE)])
 @pytest.mark.filterwarnings("error")
 def test_pettingzoos_api_test(name):
     parallel_api_test(envs.make(name, max_steps=150), num_cycles=400)

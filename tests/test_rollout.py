@@ -1,14 +1,13 @@
 """Whole episodes: compiled play against a plain loop over the vector face, what a rollout holds, and other policies."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
 
 import envs
 from algos import pg
-from tests.helpers import use_double_precision
+from envs.rollout import draw_action
+from tests.helpers import RACE, assert_one_sentence, assert_refused
 
 TRIALS = 3
 LIMIT = {"gotogether": 60}
@@ -22,13 +21,73 @@ def generators(*seeds):
     return [np.random.default_rng(seed) for seed in seeds]
 
 
-def networks(world, seed=0, trials=TRIALS, hidden=(16, 8)):
+def networks(world, seed=0, trials=TRIALS, hidden=(16, 8), dtype=torch.float):
     """Stacked policies that are far from uniform."""
     policy = pg.StackedMLP(
         generators(*range(seed, seed + trials)), world.num_agents, [world.obs_dim, *hidden, world.num_actions]
     )
-    policy.params = [(3 * param).detach().requires_grad_() for param in policy.params]
+    policy.params = [(3 * param).detach().to(dtype).requires_grad_() for param in policy.params]
     return policy
+
+
+# --- what is drawn ---
+
+
+def draw(logits, uniforms, temperature=1.0):
+    """The actions that the uniform numbers draw from the softmax of these logits."""
+    probs = np.full(len(logits), np.nan)
+    envs.softmax(np.asarray(logits, np.float32), probs, temperature)
+    return np.array([draw_action(probs, u, False) for u in uniforms])
+
+
+@pytest.mark.parametrize("temperature", [1.0, 0.4])
+def test_actions_have_the_frequencies_of_the_softmax(temperature):
+    draws = 20_000
+    even = (np.arange(draws) + 0.5) / draws
+    for logits in np.random.default_rng(0).normal(scale=2, size=(6, 5)):
+        frequencies = np.bincount(draw(logits, even, temperature), minlength=5) / draws
+        expected = torch.softmax(torch.from_numpy(logits) / temperature, -1).numpy()
+        assert np.abs(frequencies - expected).max() < 2 / draws
+
+
+def test_a_uniform_number_is_inverted_exactly():
+    logits = np.log(np.array([1, 2, 3, 2]) / 8)
+    for below, above, bound in ((0, 1, 1 / 8), (1, 2, 3 / 8), (2, 3, 6 / 8)):
+        assert draw(logits, [bound - 1e-6, bound + 1e-6]).tolist() == [below, above]
+
+
+@pytest.mark.parametrize(
+    ("logits", "possible"),
+    [
+        ([0, 0, 0], {0, 1, 2}),
+        ([1e4, -1e4, -1e4], {0}),
+        ([-1e4, 1e4, -1e4], {1}),
+        ([-1e4, -1e4, 1e4], {2}),
+        ([-1e4, 0, 0], {1, 2}),
+        ([0.1, 0.3, 1e4], {2}),
+        ([-1e4, -1e4, -1e4], {0, 1, 2}),
+        ([1e4, 1e4, 1e4], {0, 1, 2}),
+    ],
+)
+def test_extreme_logits_give_possible_actions(logits, possible):
+    assert set(draw(logits, [0.0, 5e-324, 0.5, 1 - 2**-53])) <= possible
+
+
+def test_no_action_is_ever_out_of_range():
+    rng = np.random.default_rng(1)
+    logits = rng.normal(size=(20_000, 4)) * 10.0 ** rng.integers(-3, 5, (20_000, 1))
+    actions = np.array([draw(row, [0.0, 1 - 2**-53]) for row in logits])
+    assert (actions.min(), actions.max()) == (0, 3)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.2, 1.0])
+def test_the_first_of_the_highest_values_is_played_but_with_probability_epsilon_any(epsilon):
+    probs = np.full(4, np.nan)
+    envs.epsilon_greedy(np.array([1.0, 5.0, -2.0, 5.0], np.float32), probs, epsilon)
+    assert probs == pytest.approx([epsilon / 4, 1 - epsilon + epsilon / 4, epsilon / 4, epsilon / 4], abs=1e-12)
+
+
+# --- compiled play and plain play ---
 
 
 def plain_play(world, policy, uniforms, probabilities):
@@ -89,39 +148,28 @@ def epsilon_greedy(values):
     return probs
 
 
+HOW = {  # the head, its parameter, whether greedily, the type of the weights, and the same in plain numpy
+    "softmax": (envs.softmax, 1.0, False, torch.float, softmax),
+    "a low temperature": (envs.softmax, 0.5, False, torch.float, lambda logits: softmax(logits / 0.5)),
+    "epsilon-greedy": (envs.epsilon_greedy, 0.3, False, torch.float, epsilon_greedy),
+    "greedy": (envs.softmax, 1.0, True, torch.float, lambda logits: np.eye(len(logits))[logits.argmax()]),
+    "double precision": (envs.softmax, 1.0, False, torch.double, softmax),
+}
+
+
 @pytest.mark.parametrize("name", envs.WORLDS)
-@pytest.mark.parametrize(("head", "parameter", "plain"), [("softmax", 1.0, softmax), ("epsilon_greedy", 0.3, epsilon_greedy)])
-def test_compiled_play_is_plain_play_action_for_action(name, head, parameter, plain):
+@pytest.mark.parametrize("how", HOW)
+def test_compiled_play_is_plain_play_action_for_action(name, how):
+    head, parameter, greedy, dtype, plain = HOW[how]
     world = world_of(name)
-    policy, rollout, act = networks(world), envs.Rollout(world, TRIALS, head=getattr(envs, head)), generators(5, 6, 7)
+    policy, act = networks(world, seed=4, dtype=dtype), generators(5, 6, 7)
+    rollout = envs.Rollout(world, TRIALS, head=head, greedy=greedy)
     rollout.play(policy.params, act, parameter)
     expected = plain_play(world, policy, uniforms_of(world, (5, 6, 7)), plain)
     for k, episode in enumerate(expected):
         assert_same_episode(rollout, k, episode)
     # The generators have gone on by a whole episode's uniforms, whatever its length.
     assert act[0].random() == np.random.default_rng(5).random(world.max_steps * world.num_agents + 1)[-1]
-
-
-def test_networks_in_double_precision_play_too(monkeypatch):
-    use_double_precision(pg, monkeypatch)
-    world = world_of("pushbox")
-    policy = pg.StackedMLP(generators(1), 2, [world.obs_dim, 16, world.num_actions])
-    assert policy.params[0].dtype == torch.double
-    rollout = envs.Rollout(world, 1)
-    rollout.play(policy.params, generators(5))
-    assert_same_episode(rollout, 0, plain_play(world, policy, uniforms_of(world, [5]), softmax)[0])
-
-
-def test_the_likeliest_actions_are_played_greedily():
-    world = world_of("findtreasure")
-    policy, rollout = networks(world, seed=4), envs.Rollout(world, TRIALS, greedy=True)
-    rollout.play(policy.params, generators(1, 2, 3))
-
-    def certain(logits):
-        return np.eye(len(logits))[logits.argmax()]
-
-    for k, episode in enumerate(plain_play(world, policy, uniforms_of(world, (8, 9, 10)), certain)):
-        assert_same_episode(rollout, k, episode)
 
 
 @pytest.mark.parametrize("name", envs.WORLDS)
@@ -229,6 +277,17 @@ def test_merging_equal_vectors_by_the_first_time_they_come():
             assert not rows[length:, k, i].any()
 
 
+def test_the_next_episode_overwrites_the_arrays(played):
+    rollout, policy = played
+    names = ("obs", "rows", "actions", "reward", "lengths", "outcomes", "all_obs", "states", "entropy")
+    before = {name: getattr(rollout, name) for name in names}
+    copies = {name: array.copy() for name, array in before.items()}
+    rollout.play(policy.params, generators(200, 201, 202))
+    for name, array in before.items():
+        assert np.shares_memory(array, getattr(rollout, name)), name
+        assert name == "rows" or not np.array_equal(array, copies[name]), name
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_numbers_that_are_not_finite_are_noticed(value):
     world = world_of("pushbox")
@@ -284,56 +343,39 @@ def test_what_a_policy_carries_along_belongs_to_a_trial_whatever_ends_when():
 
 # --- a world of the user's own ---
 
-WORLD = """
-import numpy as np
-
-import envs
-
-
-@envs.rule
-def step(rules, state, actions):
-    state[1] = min(state[1] + actions[0], 4)
-    state[3] = min(state[3] + actions[1], 4)
-    return {reward}, int(state[1] == 4 and state[3] == 4)
-
-
-class Race(envs.PositionWorld):
-    action_names = ("stay", "go")
-    outcome_names = ("there",)
-    best_outcome = 1
-    step = staticmethod(step)
-
-    def __init__(self, max_steps: int = 20):
-        super().__init__(np.zeros(1), [0, 0, 1, 0], 5, num_agents=2, observation="positions", max_steps=max_steps)
-"""
-
 
 def test_an_edited_world_plays_by_its_new_rules(tmp_path):
-    path, totals = tmp_path / "race.py", []
-    for reward in (1.0, -2.0):
-        path.write_text(WORLD.format(reward=reward))
-        world = envs.make_world(str(path))
+    path, text = tmp_path / "race.py", RACE.read_text()
+    assert text.count("REWARD = 10.0\n") == 1
+    for reward in (10.0, -2.0):
+        path.write_text(text.replace("REWARD = 10.0\n", f"REWARD = {reward}\n"))
+        world = envs.make_world(str(path), size=4)
         rollout = envs.Rollout(world, 1)
-        policy = pg.StackedMLP(generators(1), 2, [world.obs_dim, 4, world.num_actions])
-        rollout.play(policy.params, generators(2))
-        totals.append(rollout.reward[:, 0, 0].sum() / rollout.lengths[0])
-        assert envs.optimum(str(path)).fewest["there"].total == 4 * reward
-        time.sleep(1.1)  # numba looks at a file's time in whole seconds, and at its size
-    assert totals == [1.0, -2.0]
+        rollout.play(networks(world, trials=1).params, generators(2))
+        assert rollout.terminated.all()
+        assert rollout.reward[:, 0, 0].tolist() == [-0.1] * (rollout.lengths[0] - 1) + [reward]
+        assert envs.optimum(str(path), size=4).fewest["there"].total == pytest.approx(reward - 0.2)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("import envs", "must define one subclass of envs.World, not 0"),
-        (WORLD.format(reward=1.0) + "\n\nclass Other(Race):\n    pass\n", "must define one subclass of envs.World, not 2"),
+        (RACE.read_text() + "\n\nclass Other(Race):\n    pass\n", "must define one subclass of envs.World, not 2"),
         ("1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
         ("def", "cannot be imported: SyntaxError"),
-        (WORLD.format(reward=1.0).replace("@envs.rule\n", ""), "must be functions compiled by envs.rule"),
+        (RACE.read_text().replace("@envs.rule\n", ""), "must be functions compiled by envs.rule"),
     ],
 )
 def test_a_file_without_a_world_says_what_is_wrong(text, said, tmp_path):
     path = tmp_path / "race.py"
     path.write_text(text)
-    with pytest.raises(envs.UsageError, match=said):
+    with pytest.raises(envs.UsageError, match=said) as error:
         envs.make_vec(str(path)).world.compiled  # noqa: B018
+    assert_one_sentence(str(error.value))
+
+
+def test_the_options_of_a_world_of_ones_own():
+    assert envs.make_world(str(RACE), size=3, max_steps=7).max_steps == 7
+    assert_refused("it takes size, max_steps", envs.make_world, str(RACE), speed=3)
+    assert_refused("at least 2", envs.make_world, str(RACE), size=1)

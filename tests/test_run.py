@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -74,6 +75,15 @@ def test_a_time_limit_among_the_options_of_the_world_counts(tmp_path):
     assert command("pg", *words).code == 0
     assert json.loads((tmp_path / "args.json").read_text())["args"]["max_steps"] == 7
     assert results(tmp_path)["lengths"].max() <= 7
+
+
+def test_compiled_functions_are_found_whatever_name_a_script_was_imported_by(tmp_path):
+    call = "print(m.discounted_returns(np.ones((2, 1, 1)), np.array([2]), 0.5)[:, 0, 0])"
+    for module, folder in (("pg", ALGOS), ("algos.pg", ALGOS.parent)):
+        code = f"import numpy as np, {module} as m; {call}"
+        environment = {**os.environ, "PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(tmp_path)}
+        ended = subprocess.run([sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True)
+        assert (ended.returncode, ended.stdout) == (0, "[1.5 1. ]\n"), ended.stderr
 
 
 # --- what a finished run leaves ---
@@ -348,8 +358,16 @@ def test_a_run_may_be_stopped_twice(interrupted, tmp_path):
     assert_same_curves(tmp_path, whole)
 
 
-@pytest.mark.parametrize(("name", "optimizer"), [("pg", "sign"), ("decespg", "sign"), ("decespg", "adam")])
-def test_a_killed_run_goes_on_as_if_nothing_had_happened(name, optimizer, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "optimizer", "number", "code"),
+    [
+        ("pg", "sign", signal.SIGKILL, -9),
+        ("pg", "adam", signal.SIGINT, 130),
+        ("decespg", "sign", signal.SIGTERM, 143),
+        ("decespg", "adam", signal.SIGKILL, -9),
+    ],
+)
+def test_a_killed_run_goes_on_as_if_nothing_had_happened(name, optimizer, number, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--env", "pushbox", "--max-steps", "50", "--num-trials", "2", "--seed", "5", "--optimizer", optimizer]
     words += ["--num-episodes", "600", "--log-every", "1", "--checkpoint-every", "0", "--run-dir", "run"]
@@ -358,9 +376,9 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(name, optimizer, tmp_pa
         assert process.poll() is None
         time.sleep(0.01)
     time.sleep(0.3 * random.random())  # a moment that nobody has chosen
-    process.kill()
+    process.send_signal(number)
     out, _ = process.communicate()
-    assert (process.returncode, out) == (-signal.SIGKILL, b"")
+    assert (process.returncode, out) == (code, b"")
     assert not Path("run/episodes.npz").exists()
     done = torch.load("run/checkpoint.pt", weights_only=True)["episode"]
     assert 0 < done < 600
@@ -370,6 +388,32 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(name, optimizer, tmp_pa
     assert_same_curves(Path("run"), Path("whole"))
     left = {path.name for path in Path("run").iterdir() if not path.name.startswith(".")}
     assert left == {"args.json", "episodes.npz", "seed5", "seed6"}
+
+
+def test_checkpoints_are_so_seldom_that_they_cost_under_2_percent_of_the_time(tmp_path, monkeypatch):
+    seconds, written, record = [0.0], [], run.Run.record
+    monkeypatch.setattr(time, "monotonic", lambda: seconds[0])
+
+    def record_for_a_second(*args, **figures):
+        record(*args, **figures)
+        seconds[0] += 1.0
+
+    def save_for_three_seconds(self, episode):
+        written.append(seconds[0])
+        seconds[0] += 3.0
+
+    monkeypatch.setattr(run.Run, "record", record_for_a_second)
+    monkeypatch.setattr(run.Run, "_save_checkpoint", save_for_three_seconds)
+    train(pg, tmp_path, num_episodes=500, max_steps=3, checkpoint_every=60.0)
+    assert written == [60.0, 213.0, 366.0]  # the first after a minute, then 150 seconds after the end of the last one
+
+
+def test_a_script_may_train_in_a_thread(tmp_path):
+    """In which Python allows no handlers of signals."""
+    thread = threading.Thread(target=train, args=(pg, tmp_path), kwargs=dict(num_episodes=3, max_steps=3))
+    thread.start()
+    thread.join()
+    assert results(tmp_path)["returns"].shape == (1, 3)
 
 
 def test_an_unfinished_run_is_not_overwritten(interrupted):

@@ -1,6 +1,7 @@
 """What holds for every script: its imports, its size, the text it shares, its help, a run that resumes, its own bad input."""
 
 import ast
+import json
 import random
 import re
 import subprocess
@@ -16,6 +17,7 @@ import envs
 from envs import run
 from tests.helpers import (
     ALGOS,
+    RACE,
     SCRIPTS,
     assert_refusal,
     assert_same_results,
@@ -200,6 +202,22 @@ def test_a_script_runs_from_anywhere(name, tmp_path):
     ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert (ended.returncode, ended.stdout.count("\n")) == (0, 1), ended.stderr
     assert results(tmp_path / "runs/pushbox" / name / "seed1-num_episodes=3-max_steps=5")["returns"].shape == (1, 3)
+
+
+@each_script
+def test_a_world_of_ones_own_gets_the_values_that_the_help_names(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended = command(name, "--env", RACE, "--env-args", "size=3", "--num-episodes", 4, "--save-model", "--capture-video")
+    assert ended.code == 0, ended.err
+    directory = tmp_path / "runs" / "race" / name / "seed1-env_args=size=3-num_episodes=4"
+    args = json.loads((directory / "args.json").read_text())["args"]
+    assert (args["max_steps"], results(directory)["lengths"].shape) == (20, (1, 4))
+    text_of = {what: part.text for what, part in parts_of(name, SOURCES[f"{name}.py"]).items()}
+    for field, value in script(name).OTHER.items():
+        assert args[field] == (list(value) if isinstance(value, tuple) else value)
+        (number,) = value if isinstance(value, tuple) else (value,)
+        assert re.search(rf"; {number:g} in other|, else {number:g}\)", text_of[f"Args.{field}"])
+    assert command(name, "--evaluate", directory / "policy.pt", "--num-episodes", 2).code == 0
 
 
 # --- a run: its curves, its end by an exception, its team ---

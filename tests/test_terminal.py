@@ -10,6 +10,7 @@ from PIL import Image
 import envs
 from envs import __main__ as terminal
 from envs import gallery
+from tests.helpers import RACE
 
 
 def run(module, monkeypatch, *words, typed=""):
@@ -39,6 +40,14 @@ def test_an_episode_by_the_keyboard(monkeypatch, capsys):
 def test_the_end_of_the_input_ends_the_episode(monkeypatch, capsys):
     assert run(terminal, monkeypatch, "findtreasure", "--keys", typed="ud\n") == 0
     assert capsys.readouterr().out.endswith("stopped after 1 step, return -0.2\n")
+
+
+def test_a_world_of_ones_own(monkeypatch, capsys):
+    assert run(terminal, monkeypatch, str(RACE), "size=3", "--keys", typed="gg\nsg\ngg\n") == 0
+    printed = capsys.readouterr().out
+    assert "s stay, g go; a letter for each agent" in printed
+    assert "agent 1 observes 0 0.667 0.333 0.667  [(0, 2) (1, 2)]" in printed
+    assert printed.endswith("end: there after 3 steps, return 9.8, 4.90 per step\n")
 
 
 @pytest.mark.parametrize("name", envs.WORLDS)
