@@ -11,9 +11,9 @@ what each of agent i's own actions is worth. After each episode of T steps, with
 Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), compare
 with COMA but give no settings. lambda is that of Foerster et al.; a critic for each agent and the 200 critic steps between two
 copies of Q to Q' are those of EPyMARL's coma_ns. The hidden layers of Table 1, one critic step per episode, and policies that
-explore by themselves (no floor under their probabilities) are chosen here. So is that the critics see no observations beside the
-state, which tells them: with the state alone 18 of 20 trials in pushbox end at the large box (adam, 5000 episodes, learning rates
-3e-4 and 1e-3), with both 2, with the observations alone none.
+explore by themselves (no floor under their probabilities) are chosen here. So is that the critics see no observations beside
+the state, which tells them: with the state alone 18 of 20 trials in pushbox end at the large box (adam, 5000 episodes, learning
+rates 3e-4 and 1e-3), with both 2, with the observations alone none.
 
     python algos/coma.py --env findtreasure --num-trials 20
 """
