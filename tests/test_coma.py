@@ -76,27 +76,26 @@ def test_the_expected_gradient_of_the_climb_game_is_its_closed_form(seed):
 # --- what the critics see ---
 
 
-def plain_input(scale, state, obs, actions, i, num_actions):
-    """What agent i's critic is asked in one step: state [state_dim], obs [num_agents, obs_dim], actions [num_agents]."""
+def plain_input(scale, state, actions, i, num_actions):
+    """What agent i's critic is asked in one step: state [state_dim], actions [num_agents]."""
     agents = len(actions)
     others = [(i + step) % agents for step in range(1, agents)]
     one_hot = (np.eye(num_actions)[actions[j]] for j in others)
-    return np.concatenate([state * scale, *obs, *one_hot]).astype(np.float32)
+    return np.concatenate([state * scale, *one_hot]).astype(np.float32)
 
 
 @pytest.mark.parametrize("agents", [1, 2, 3, 4])
-def test_a_critic_is_asked_with_the_state_all_observations_and_the_others_actions(agents):
+def test_a_critic_is_asked_with_the_state_and_the_others_actions(agents):
     rng = np.random.default_rng(2)
-    obs, actions = rng.random((6, 3, agents, 5), np.float32), rng.integers(4, size=(6, 3, agents))
-    rollout = SimpleNamespace(all_obs=obs, global_state=rng.random((6, 3, 7), np.float32))
-    inputs = coma.critic_inputs(rollout, actions, 4)
-    assert (inputs.shape, inputs.dtype) == ((6, 3, agents, 7 + agents * 5 + (agents - 1) * 4), np.float32)
+    states, actions = rng.random((6, 3, 7), np.float32), rng.integers(4, size=(6, 3, agents))
+    inputs = coma.critic_inputs(states, actions, 4)
+    assert (inputs.shape, inputs.dtype) == ((6, 3, agents, 7 + (agents - 1) * 4), np.float32)
     for t, k, i in np.ndindex(6, 3, agents):
-        assert np.array_equal(inputs[t, k, i], plain_input(1, rollout.global_state[t, k], obs[t, k], actions[t, k], i, 4))
+        assert np.array_equal(inputs[t, k, i], plain_input(1, states[t, k], actions[t, k], i, 4))
     for i in range(agents):
         changed = actions.copy()
         changed[:, :, i] = (actions[:, :, i] + 1) % 4
-        same = (coma.critic_inputs(rollout, changed, 4) == inputs).all(3)
+        same = (coma.critic_inputs(states, changed, 4) == inputs).all(3)
         assert same[:, :, i].all()
         assert not np.delete(same, i, axis=2).any()
 
@@ -107,8 +106,8 @@ def test_the_critics_tell_states_apart_that_look_the_same_to_all_agents():
     states = np.array([[0, 0, 1, 3, 0, 3, 2, 2, 2], [0, 1, 1, 3, 0, 3, 2, 2, 2]])
     obs = np.array([look(world, state) for state in states], np.float32)
     assert np.array_equal(*obs)
-    rollout = SimpleNamespace(all_obs=obs[:, None], global_state=(states * world.state_scale).astype(np.float32)[:, None])
-    inputs = coma.critic_inputs(rollout, np.zeros((2, 1, 2), int), 4)
+    scaled = (states * world.state_scale).astype(np.float32)[:, None]
+    inputs = coma.critic_inputs(scaled, np.zeros((2, 1, 2), int), 4)
     critic = coma.build(coma.Args(hidden=(64, 32)), world, [np.random.default_rng(0)]).critic
     first, second = critic(inputs[:, 0].transpose(1, 0, 2)).detach().unbind(1)  # [num_agents, num_actions]
     assert float((first - second).abs().min()) > 1e-4
@@ -201,8 +200,8 @@ def test_the_critics_of_a_loop_learn_that_the_time_limit_ends_nothing(tmp_path, 
     monkeypatch.setattr(coma, "Rollout", Loop)
     args = dict(num_trials=2, num_episodes=1000, max_steps=5, hidden=(16,), gamma=0.9, learning_rate=0.0)
     trained = train(coma, tmp_path, **args, critic_learning_rate=1e-2, target_critic_every=5)
-    state, obs = np.ones(9), np.full((2, 5), 0.5)
-    seen = [plain_input(trained.log.world.state_scale, state, obs, (other, other), 0, 4) for other in range(4)]
+    state = np.ones(9)
+    seen = [plain_input(trained.log.world.state_scale, state, (other, other), 0, 4) for other in range(4)]
     values = 10 * trained.critic(np.tile(seen, (4, 1, 1))).detach().view(2, -1).numpy()
     fixed = 0.0
     for _ in range(500):  # of q = the mean of all targets in an episode that ends
@@ -280,7 +279,7 @@ def test_every_update_of_actors_and_critics(world, tmp_path, monkeypatch):
             actions = np.array([*rollout.actions[:length, k], drawn])
             figures = []
             for i in range(agents):
-                inputs = [plain_input(scale, *step, i, num_actions) for step in zip(states, obs, actions, strict=True)]
+                inputs = [plain_input(scale, *step, i, num_actions) for step in zip(states, actions, strict=True)]
                 target_values = [float(plain_logits(target[i], x)[a]) for x, a in zip(inputs, actions[:, i], strict=True)]
                 following, targets = 0.0 if terminated else target_values[length], np.zeros(length)
                 for t in reversed(range(length)):
@@ -324,7 +323,7 @@ def test_critics_have_the_hidden_layers_of_table_1_and_weights_drawn_after_the_a
     args = dict(env="pushbox", seed=4, num_trials=2, num_episodes=1, learning_rate=0.0, critic_learning_rate=0.0)
     trained = train(coma, tmp_path, **args)
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (4, 5)]
-    for found, sizes in ((trained.policy, [5, 64, 32, 4]), (trained.critic, [9 + 14, 64, 32, 4])):
+    for found, sizes in ((trained.policy, [5, 64, 32, 4]), (trained.critic, [9 + 4, 64, 32, 4])):
         assert all(map(torch.equal, found.params, coma.StackedMLP(fresh, 2, sizes).params))
 
 
@@ -360,6 +359,6 @@ def test_a_run_that_was_stopped_goes_on_with_its_target_critics_and_draws(tmp_pa
 
 
 def test_coma_learns_to_push_boxes(tmp_path):
-    args = dict(learning_rate=1e-3, critic_learning_rate=1e-2, target_critic_every=50)
-    log = train(coma, tmp_path, env="pushbox", num_trials=4, num_episodes=1000, max_steps=50, **args).log
-    assert log.means(slice(-100, None))["reward_per_step"].min() > 1
+    log = train(coma, tmp_path, env="pushbox", optimizer="adam", num_trials=4, num_episodes=1500, max_steps=50).log
+    first, last = (log.means(part)["reward_per_step"] for part in (slice(100), slice(-100, None)))
+    assert last.min() > 1.2 > first.max()
