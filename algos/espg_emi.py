@@ -286,7 +286,8 @@ class SelectiveMemory:
     def remember(self, rollout, returns):
         """Keep each trial's episode if it is better than the worst one kept for its terminal state.
 
-        returns [T, num_trials] are those of the original reward; on a tie the older episode stays.
+        returns [T, num_trials] are those of the original reward. An episode that is only as good as the worst does not replace
+        it; of several that are equally bad, the one in the first slot goes.
         """
         for k, (outcome, length) in enumerate(zip(rollout.outcomes, rollout.lengths, strict=True)):
             values = self.value[k, outcome]
@@ -301,8 +302,9 @@ class SelectiveMemory:
     def replay(self):
         """The second term of Eq. 16, sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j, as weights of log pi(a | o).
 
-        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed. Every distinct
-        observation is there once: obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
+        g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed, which Eq. 16
+        does not say; but shares of a sum that may be 0 or negative are none. Every distinct observation is there once:
+        obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
         What is stored does not change, so the steps are merged again only when a better episode has come.
         """
         changed = [k for k, replay in enumerate(self.replays) if replay is None]
