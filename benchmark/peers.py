@@ -327,9 +327,9 @@ def main(episodes: int = 500):
     """
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # all threads of all libraries share one core
     torch.set_num_threads(1)
-    rows = []
+    head = ["what", "return at the end", "1 trial: us per step", ": pg", "20 trials: us per step", ": pg"]
     for world in SETTINGS:
-        base = {}
+        rows, base = [], {}
         for peer, package, run in (
             ("pg", "torch", run_pg),
             ("loop", "torch", run_loop),
@@ -345,11 +345,9 @@ def main(episodes: int = 500):
             cost = cost if together else dict.fromkeys((1, 20), cost[ALONE])
             base = base or cost
             returns = next(reversed(measured.values()))[0]
-            words = [f"{returns[:, -max(1, episodes // 10) :].mean():.2f}"]
-            rows.append([world, peer, *words])
+            rows.append([peer, f"{returns[:, -max(1, episodes // 10) :].mean():.2f}"])
             rows[-1] += [word for n in (1, 20) for word in (f"{cost[n] * 1e6:.1f}", f"{cost[n] / base[n]:.2f}")]
-    head = ["world", "what", "return at the end", "1 trial: us per step", ": pg", "20 trials: us per step", ": pg"]
-    print_table(f"REINFORCE for {episodes} episodes, processor time on one core:", head, rows)
+        print_table(f"REINFORCE in {world}, {episodes} episodes, processor time on one core:", head, rows)
 
 
 if __name__ == "__main__":
