@@ -29,6 +29,6 @@ def test_trials_are_runs_in_single_precision(name, tmp_path):
 
 @each_script_and_setting
 def test_the_same_command_gives_the_same_run(name, setting, tmp_path):
-    args = dict(setting, num_trials=2, num_episodes=100)
+    args = dict(setting, num_trials=2, num_episodes=100, max_steps=60)
     first, second = (train(script(name), tmp_path / which, **args) for which in ("first", "second"))
     assert_same_run(first, second, parts=vars(first).keys() - {"log"})
