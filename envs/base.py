@@ -75,7 +75,7 @@ class World:
         """Arguments:
         rules:       what `step` and `observe` take as their first argument
         start:       initial state, integers [state_dim]
-        local_index: which entries of the state belong to each agent (its position, facing, the box), [num_agents, d]
+        local_index: which entries of the state belong to each agent (its position and facing, the boxes), [num_agents, d]
         num_agents:  number of agents
         obs_dim:     length of one agent's observation
         cell:        width of one cell in units of the observation (1 / size for scaled positions, 1 for one-hot)

@@ -155,7 +155,8 @@ class PushBox(World):
         super().__init__(
             rules=np.array([(size, left, right, large, *penalties)], RULES),
             start=[left, y, EAST, right, y, WEST, size // 2, size // 2, size // 2],
-            local_index=[[0, 1, 2], [3, 4, 5]],
+            # An agent's own x, y and facing, and the boxes, which for n = 4 move in an episode's last step only.
+            local_index=[[0, 1, 2, LEFT_Y, RIGHT_Y, LARGE_Y], [3, 4, 5, LEFT_Y, RIGHT_Y, LARGE_Y]],
             num_agents=2,
             obs_dim=5,
             cell=1.0,

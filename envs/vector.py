@@ -25,7 +25,7 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         truncated    bool [num_envs], the time limit has cut it
         info         "outcome" int64 [num_envs] (0: running or cut, k: ended as world.outcome_names[k - 1]),
                      "state" float32 [num_envs, d_s] (everything there is to know, scaled to about [0, 1]),
-                     "local_state" int64 [num_envs, num_agents, d] (an agent's own position, facing, and the box)
+                     "local_state" int64 [num_envs, num_agents, d] (an agent's own position and facing, and the boxes)
     """
 
     def __init__(self, world: World, num_envs: int = 1):

@@ -133,6 +133,11 @@ def test_agents_see_the_cell_in_front(agent, other, seen):
     assert look(LARGE, [*other, *agent, *BOXES_6])[1] == one_hot
 
 
+def test_a_local_state_is_ones_own_place_and_facing_and_the_boxes():
+    state = np.array([0, 3, N, 5, 1, W, 4, 3, 2])
+    assert state[LARGE.local_index].tolist() == [[0, 3, N, 4, 3, 2], [5, 1, W, 4, 3, 2]]
+
+
 @pytest.mark.parametrize("size", [4, 6, 8, 10])
 @given(data=st.data())
 def test_boxes_stay_in_the_room_and_move_only_when_pushed(size, data):
