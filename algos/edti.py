@@ -1,19 +1,24 @@
 """EDTI: exploration via decision-theoretic influence with counts (Wang et al., ICLR 2020), on the base of ac.py.
 
-Agent i's reward grows by what is new to itself, and by what its presence is worth to the others where they go next:
+Agent i's reward grows by what is new to itself, by what the others gain now, and by what its presence is worth to them where
+they go next:
 
-    rhat_i = r + u_i + sum_{j != i} gamma c_ij (beta_ext V_j^ext(o_j,t+1) + beta_int V_j^int(o_j,t+1)),
-    u_i = eta / sqrt(N(x_i') + 1) and c_ij = 1 - p(x_j' | x_-i, a_-i) / p(x_j' | x, a).
+    rhat_i = r + u_i + sum_{j != i} [share_ext r + share_int u_j + gamma c_ij (beta_ext V_j^ext(o_j') + beta_int V_j^int(o_j'))]
+    with u_i = eta / sqrt(N(x_i') + 1) and c_ij = 1 - p(x_j' | x_-i, a_-i) / p(x_j' | x, a).
 
-x_i is agent i's local state (its place, facing and the box), N and p are counts, -i means all agents but i. Every agent learns
-like ac.py's, but from three values of its own observation: V_i of rhat_i, which its actor needs, V_i^ext of r, V_i^int of u_i.
-ac.py's critic of the joint observation becomes these, because what c_ij weighs is the value of o_j to agent j, and because the
-paper says of EDTI only that its agents are local (Jiang & Amato, SAC 2021); it does not say on which learner EDTI ran.
+x_i is agent i's local state (its place and facing, and the boxes), N and p are counts, a prime marks what follows a step, and
+-i means all agents but i. Every agent learns like ac.py's, but from three values of its own observation: V_i of rhat_i, which
+its actor needs, V_i^ext of r, V_i^int of u_i. ac.py's critic of the global state becomes these, because what c_ij weighs is the
+value of o_j to agent j, and because the paper says of EDTI only that its agents are local (Jiang & Amato, SAC 2021); it does
+not say on which learner EDTI ran.
 
-u, c and the three values per agent are those of the published code (TonghanWang/EITI-EDTI, Curiosity.py and ppo2/runner.py: the
-option --tv with count-based probabilities), its eta 10, beta_ext 0.1 and beta_int 1 those of its task Pass, where the reward is
-1000. u adds to r, so eta is scaled by the world's largest reward / 1000. The betas are not: c has no unit, and V^ext and V^int
-have that of r and u. Unlike there, nothing follows the step that terminates an episode, and PPO gives way to ac.py's update.
+rhat is that of the published code (TonghanWang/EITI-EDTI, Curiosity.py and ppo2/runner.py: count-based probabilities and the
+option --r_tv, which README.md says is EDTI). The weights are those of README.txt for its task Pass, the only ones published,
+though it runs --tv, which has no shares. Without shares, with these and with share_int 1 five teams end in findtreasure at 5.4,
+6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3 (adam), each +- 1 to 2. That of r only makes it count more, because r is the team's. The
+reward of Pass is 1000 and u adds to r, so eta is scaled by the world's largest reward / 1000. The other weights are not: they
+and c have no unit, and V^ext and V^int have that of r and u. Unlike there, nothing follows the step that terminates an episode,
+and PPO gives way to ac.py's update.
 
     python algos/edti.py --env pushbox --num-trials 20
 """
@@ -72,6 +77,10 @@ class Args(RunArgs):
     """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     eta: Annotated[float | None, AtLeast(0)] = None
     """weight of the novelty u, in thousandths of the world's largest reward (None: tuned for world and optimiser, else 10)"""
+    share_ext: Annotated[float, AtLeast(0)] = 0.1
+    """weight of the others' rewards (the published code's)"""
+    share_int: Annotated[float, AtLeast(0)] = 0.1
+    """weight of the others' novelty (the published code's)"""
     beta_ext: Annotated[float, AtLeast(0)] = 0.1
     """weight of the influence on the others' values of the reward, V^ext (the published code's)"""
     beta_int: Annotated[float, AtLeast(0)] = 1.0
@@ -222,15 +231,16 @@ class TransitionCounts:
         return count_transitions(rollout.local_state, rollout.actions, rollout.lengths, *self.state)
 
 
-def influence_rewards(influence, worth, lengths, terminated, gamma):
-    """sum_{j != i} gamma c_ij w_j(o_j,t+1) of every step and agent i, [T, num_trials, num_agents].
+def influence_rewards(shared, influence, worth, lengths, terminated, gamma):
+    """sum_{j != i} (s_j + gamma c_ij w_j(o_j')) of every step and agent i, [T, num_trials, num_agents].
 
-    influence [T, num_trials, num_agents, num_agents], worth w [T + 1, num_trials, num_agents], lengths and terminated
-    [num_trials]. As in `td_errors`, nothing is worth anything after the step that terminates an episode.
+    shared s [T, num_trials, num_agents], influence c [T, num_trials, num_agents, num_agents], worth w [T + 1, num_trials,
+    num_agents], lengths and terminated [num_trials]. As in `td_errors`, nothing is worth anything after the step that
+    terminates an episode.
     """
-    steps = np.arange(len(influence))[:, None]
+    steps, others = np.arange(len(influence))[:, None], 1 - np.eye(influence.shape[2])
     goes_on = (steps < lengths - 1) | ~terminated
-    return gamma * (influence * (goes_on[:, :, None] * worth[1:])[:, :, None]).sum(3)
+    return shared @ others + gamma * (influence * (goes_on[:, :, None] * worth[1:])[:, :, None]).sum(3)
 
 
 def build(args, world, init):
@@ -272,7 +282,8 @@ def train(args: Args):
         # The agents' augmented rewards, and the errors of all three values.
         of_kind = detached.reshape(-1, trials, 3, agents)
         worth = (of_kind * np.array([[0.0], [args.beta_ext], [args.beta_int]])).sum(2)
-        augmented = reward + bonus + influence_rewards(influence, worth, lengths, terminated, args.gamma)
+        shared = args.share_ext * reward + args.share_int * bonus
+        augmented = reward + bonus + influence_rewards(shared, influence, worth, lengths, terminated, args.gamma)
         rewards = np.stack([augmented, reward, bonus], axis=2).reshape(len(reward), -1)  # [T, num_critics]
         delta = td_errors(rewards, detached, lengths[of_critic], terminated[of_critic], args.gamma)
 
