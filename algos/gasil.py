@@ -7,10 +7,10 @@
    is positive for what good episodes do more often than the current one, and negative for what they do less often.
 
 Hao et al., "Independent Generative Adversarial Self-Imitation Learning in Cooperative Multiagent Systems" (AAMAS 2019). Labels,
-r_im, the rise of lambda_im, the number of good episodes and D's layers are those of its code, which trains deterministic
-policies with critics for 140 000 episodes (github.com/tjuHaoXiaotian/GASIL). Here policies draw their actions and learn from
-the episode that they have just played, never from stored actions, as in Guo et al., "Generative Adversarial Self-Imitation
-Learning" (2018). What else differs from the code:
+r_im, the rise of lambda_im, the number of good episodes, without which nobody imitates, and D's layers, Adam (0.5, 0.9) and
+clipped gradients are those of its code, which trains deterministic policies with critics for 140 000 episodes
+(github.com/tjuHaoXiaotian/GASIL). Here policies draw their actions and learn from the episode that they have just played,
+never from stored actions, as in Guo et al., "Generative Adversarial Self-Imitation Learning" (2018). What else differs:
 - Good is a high discounted return, as for decespg.py's memory: the undiscounted one does not prefer a shorter way. Stored
   episodes do not age (in the code their return falls by 0.01 in every episode, which belongs to its scale of reward): these
   worlds are deterministic, so a success is never luck.
@@ -86,7 +86,7 @@ class Args(RunArgs):
     rise: Annotated[float, Between(1e-3, 1)] = 0.086
     """share of the episodes in which lambda_im rises to its final weight (Hao et al.: 12 000 of 140 000)"""
     good_episodes: Annotated[int, AtLeast(1)] = 32
-    """best episodes that the team keeps (Hao et al.)"""
+    """best episodes that the team keeps, and how many it has before anybody imitates (Hao et al.)"""
     good_label: Annotated[float, Between(0, 1)] = 0.9
     """what the discriminators are to say to good steps, less than 1 so that they stay unsure (Hao et al.)"""
     good_batch: Annotated[int, AtLeast(1)] = 128
@@ -311,7 +311,9 @@ class Discriminators:
         # Observations to log D / (1 - D) of the actions.
         self.net = StackedMLP(init, world.num_agents, [world.obs_dim, *hidden, world.num_actions])
         self.params, self.good_label = self.net.params, good_label
-        self.optimizer = torch.optim.Adam(self.params, lr=learning_rate, fused=True)
+        self.optimizer = torch.optim.Adam(self.params, lr=learning_rate, betas=(0.5, 0.9), fused=True)
+        for param in self.params:  # no weight matrix or bias vector of any network gets a gradient of a norm above 1/2
+            param.register_hook(lambda grad: grad.renorm(2, 0, 0.5))
 
     def learn(self, good, own):
         """One step towards telling good steps from own ones, both as `step_shares` gives them.
@@ -368,15 +370,18 @@ def train(args: Args):
         bonus, unvisited, overvisited = team.novelty.bonus(pairs, rollout.lengths)  # [T, num_trials, num_agents]
         augmented = rollout.reward + args.beta * bonus
 
-        # Keep the good episodes, by the original reward, and learn to tell their steps from those of this one.
+        # Keep the good episodes, by the original reward.
         team.good.remember(episode, rollout, discounted_returns(rollout.reward, rollout.lengths, args.gamma)[0, :, 0])
-        own_steps = step_shares(rollout.all_obs, rollout.actions, rollout.lengths, world.num_actions)
-        good_steps = step_shares(*team.good.draw(learn, args.good_batch), batch, world.num_actions)
-        d_good, d_own = team.discriminators.learn(good_steps, own_steps)
+        d_good = d_own = np.full(args.num_trials, 0.5)
+        if episode + 1 >= args.good_episodes:  # all their places are taken
+            # Learn to tell their steps from those of this episode.
+            own_steps = step_shares(rollout.all_obs, rollout.actions, rollout.lengths, world.num_actions)
+            good_steps = step_shares(*team.good.draw(learn, args.good_batch), batch, world.num_actions)
+            d_good, d_own = team.discriminators.learn(good_steps, own_steps)
 
-        # Augment each agent's reward with that for what looks like good episodes.
-        lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / (args.rise * args.num_episodes) - 1)))
-        augmented += lambda_im * team.discriminators.reward(rollout)
+            # Augment each agent's reward with that for what looks like good episodes.
+            lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / (args.rise * args.num_episodes) - 1)))
+            augmented += lambda_im * team.discriminators.reward(rollout)
 
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.
         returns = discounted_returns(augmented, rollout.lengths, args.gamma)

@@ -122,7 +122,7 @@ def test_steps_are_drawn_uniformly_and_for_the_whole_team():
 # --- discriminators ---
 
 
-def tabular(label, learning_rate=0.05):
+def tabular(label, learning_rate=0.002):
     """Discriminators without hidden layers of two agents that observe one of three one-hot states and have two actions."""
     world = SimpleNamespace(num_agents=2, obs_dim=3, num_actions=2)
     return gasil.Discriminators([np.random.default_rng(0)], world, (), learning_rate, label)
@@ -171,13 +171,29 @@ def test_who_does_as_good_episodes_do_gets_no_reward_or_a_little_less(label, rew
 
 
 def test_what_only_one_side_does_is_told_apart_within_the_clips():
-    discriminators = tabular(1.0)
+    discriminators = tabular(1.0, learning_rate=0.05)
     good, own = (np.array([[0.5, 0], [0, 0.5], [0, 0]]), np.array([[0, 0.5], [0, 0], [0.5, 0]]))
     d = learnt(discriminators, exactly(good, own), exactly(own, good), 3000)
     assert np.all(d[0][good > 0] > 0.99)
     assert np.all(d[0][own > 0] < 0.01)
     found = discriminators.reward(steps_of_a_team(np.eye(3, dtype=np.float32)[[0, 1, 0, 2]], [0, 1, 1, 0]))
     assert found[:, 0].tolist() == [[1.5, -0.5], [1.5, -0.5], [-0.5, 1.5], [-0.5, 1.5]]
+
+
+def test_gradients_are_clipped_for_each_network_and_each_of_its_arrays(monkeypatch):
+    discriminators, rho = tabular(1.0), np.full((3, 2), 1 / 6)
+    good, own = exactly(50 * rho, rho), exactly(0 * rho, 0 * rho)  # what agent 0 learns from counts fifty times
+    monkeypatch.setattr(gasil, "update", lambda optimizer, kind, loss: loss.backward())
+    discriminators.learn(good, own)
+    plain = [param.detach().clone().requires_grad_() for param in discriminators.params]
+    logits = torch.baddbmm(plain[1], torch.eye(3).repeat(2, 1, 1), plain[0])
+    expected = torch.autograd.grad(-(torch.from_numpy(good[1]) * torch.nn.functional.logsigmoid(logits)).sum(), plain)
+    for param, grad in zip(discriminators.params, expected, strict=True):
+        norms = grad.flatten(1).norm(dim=1)
+        assert norms[0] > 5
+        assert norms[1] < 0.5
+        assert torch.allclose(param.grad[0], grad[0] * 0.5 / norms[0], atol=1e-6)
+        assert torch.allclose(param.grad[1], grad[1], atol=1e-6)
 
 
 def test_the_imitation_reward():
@@ -212,7 +228,8 @@ def log_d(own, obs, action):
 def discriminator_ascent(params, net, good, own, label):
     """The gradient of the mean of label log D + (1 - label) log(1 - D) over good steps and of log(1 - D) over own ones, and D.
 
-    Steps are (o, a); also returns the mean of D over the steps of either kind.
+    Steps are (o, a). Every array of the gradient is scaled down to a norm of at most 1/2; also returns their norms before, and
+    the mean of D over the steps of either kind.
     """
     own_params = [param[net].detach().double().requires_grad_() for param in params]
     total, means = 0, []
@@ -220,7 +237,9 @@ def discriminator_ascent(params, net, good, own, label):
         both = [log_d(own_params, *step) for step in steps]
         total = total + sum(target * yes + (1 - target) * no for yes, no in both) / len(steps)
         means.append(np.mean([yes.exp().item() for yes, _ in both]))
-    return torch.autograd.grad(total, own_params), means
+    grads = torch.autograd.grad(total, own_params)
+    norms = [float(grad.norm()) for grad in grads]
+    return [grad * 0.5 / max(norm, 0.5) for grad, norm in zip(grads, norms, strict=True)], norms, means
 
 
 @pytest.mark.parametrize("env", ["findtreasure", "pushbox"])
@@ -230,15 +249,15 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
     args = dict(env=env, seed=2, num_trials=trials, num_episodes=episodes, max_steps=10, learning_rate=0.02, log_every=1)
     args.update(gamma=gamma, beta=beta, lambda_im=lambda_im, rise=0.5, good_episodes=3, good_batch=20, good_label=0.8)
     trained = train(gasil, tmp_path, **args, **kernel, discriminator_hidden=(6,), discriminator_learning_rate=0.3)
-    assert len(updates) == 2 * episodes  # the discriminators', then the policies'
+    assert len(updates) == 2 + 2 * 18  # the policies', and from the third episode on the discriminators' before each of them
+    of_policies, of_discriminators = updates[:2] + updates[3::2], [None, None, *updates[2::2]]
+    after = [None, None, *(update.params for update in of_discriminators[3:]), trained.discriminators.net.params]
     num_actions, kernel["sigma"] = trained.log.world.num_actions, kernel["sigma"] * trained.log.world.cell
     plain, visited = [PlainGood(3) for _ in range(trials)], {}
     learn = [np.random.default_rng(np.random.SeedSequence(2 + k).spawn(3)[2]) for k in range(trials)]
     shown = [curves(tmp_path / f"seed{2 + k}") for k in range(trials)]
-    rewards, ends = [], set()
-    for n in range(episodes):
-        discriminators, (rollout, params, direction) = updates[2 * n : 2 * n + 2]
-        after = updates[2 * n + 2].params if n + 1 < episodes else trained.discriminators.net.params
+    rewards, ends, all_norms = [], set(), []
+    for n, (discriminators, (rollout, params, direction)) in enumerate(zip(of_discriminators, of_policies, strict=True)):
         weight = lambda_im * min(1, np.exp(-6 * (1 - n / (0.5 * episodes))))
         own_steps = {}
         for k, length in enumerate(rollout.lengths):
@@ -248,11 +267,15 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
             for i in range(2):
                 own_steps[k, i] = list(zip(obs[:, i], actions[:, i], strict=True))
         for k in range(trials):
+            if n < 2:
+                assert [shown[k][f"charts/{tag}"][n][1] for tag in ("d_good", "d_own")] == [0.5, 0.5]
+                continue
             steps, means = plain[k].steps(), []
             drawn = [steps[draw] for draw in learn[k].integers(len(steps), size=20)]
             for i in range(2):
                 good = [(obs[i], actions[i]) for obs, actions in drawn]
-                expected, d = discriminator_ascent(discriminators.params, 2 * k + i, good, own_steps[k, i], 0.8)
+                expected, norms, d = discriminator_ascent(discriminators.params, 2 * k + i, good, own_steps[k, i], 0.8)
+                all_norms += norms
                 means.append(d)
                 for found, one in zip(discriminators.direction, expected, strict=True):
                     assert np.allclose(found[2 * k + i], one, rtol=1e-4, atol=1e-6)
@@ -260,12 +283,15 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
                 assert shown[k][f"charts/{tag}"][n][1] == pytest.approx(value, abs=1e-5)
         steps_of = []
         for (k, i), steps in own_steps.items():
-            length, own = rollout.lengths[k], [param[2 * k + i].detach().double() for param in after]
+            length = rollout.lengths[k]
             now = pairs(rollout.all_obs[:length, k, i], rollout.actions[:length, k, i], num_actions)
             past = visited[k, i] = np.concatenate([visited.get((k, i), now[:0]), now])
             etas = [dense_eta(past, len(past) - length + t, **kernel) for t in range(length)]
-            d = np.array([log_d(own, *step)[0].exp().item() for step in steps])
-            r_im = np.clip(-np.log(1 - np.clip(d, 0.01, 0.99)) + np.log(0.5), -0.5, 1.5)
+            r_im = np.zeros(length)
+            if n >= 2:
+                own = [param[2 * k + i].detach().double() for param in after[n]]
+                d = np.array([log_d(own, *step)[0].exp().item() for step in steps])
+                r_im = np.clip(-np.log(1 - np.clip(d, 0.01, 0.99)) + np.log(0.5), -0.5, 1.5)
             rewards += list(r_im)
             augmented = rollout.reward[:length, k, 0] - beta * np.log(np.clip(etas, 1e-3, 1)) + weight * r_im
             returns = np.array(plain_returns(augmented, gamma))
@@ -273,6 +299,7 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
         assert_same_direction(direction, params, steps_of)
     assert min(rewards) < -0.4
     assert max(rewards) > 0.1
+    assert max(all_norms) > 0.5  # some were clipped
     assert (True in ends) == (env == "pushbox")  # nobody reaches an end of findtreasure so soon
     assert max(number for _, number, _ in plain[0].kept) > 3  # episodes were replaced
 
@@ -293,11 +320,11 @@ def test_without_imitation_and_bonus_it_is_pg_bit_for_bit(env, optimizer, tmp_pa
 @pytest.mark.parametrize("optimizer", ["sign", "adam"])
 def test_the_discriminators_have_an_adam_of_their_own(optimizer, tmp_path, monkeypatch):
     updates = record_all_updates(gasil, monkeypatch)
-    args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10)
+    args = dict(env="pushbox", optimizer=optimizer, num_trials=2, num_episodes=10, max_steps=10, good_episodes=1)
     trained = train(gasil, tmp_path, **args, discriminator_learning_rate=1e-2)
     steps = updates[::2]
     reference = [param.clone() for param in steps[0].params]
-    adam = torch.optim.Adam(reference, lr=1e-2)
+    adam = torch.optim.Adam(reference, lr=1e-2, betas=(0.5, 0.9))
     after = [*(update.params for update in steps[1:]), trained.discriminators.net.params]
     for update, following in zip(steps, after, strict=True):
         for param, direction in zip(reference, update.direction, strict=True):
@@ -308,7 +335,7 @@ def test_the_discriminators_have_an_adam_of_their_own(optimizer, tmp_path, monke
 
 def test_discriminators_of_one_agents_observation_have_weights_drawn_after_the_actors(tmp_path, monkeypatch):
     updates = record_all_updates(gasil, monkeypatch)
-    train(gasil, tmp_path, env="pushbox", seed=4, num_trials=2, num_episodes=1)
+    train(gasil, tmp_path, env="pushbox", seed=4, num_trials=2, num_episodes=1, good_episodes=1)
     fresh = [np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[0]) for seed in (4, 5)]
     gasil.StackedMLP(fresh, 2, [5, 64, 32, 4])
     expected = gasil.StackedMLP(fresh, 2, [5, 32, 32, 4])
