@@ -40,14 +40,14 @@ WORLDS = {
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-2),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-2),
+    ("findtreasure", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
+    ("findtreasure", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-2),
     ("gotogether", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("movebox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
-    ("pushbox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3),
-    ("pushbox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critic learns from rewards divided by this, so from 0.3 to 10; its curves are in units of reward

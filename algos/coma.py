@@ -52,7 +52,7 @@ TUNED = {
     ("gotogether", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("movebox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=3e-3),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
-    ("pushbox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3),
+    ("pushbox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3)  # what a world of your own gets
