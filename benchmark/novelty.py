@@ -3,7 +3,8 @@
     python benchmark/novelty.py                          # some minutes; draws docs/novelty.png
 
 Trains each script as it is, at its own defaults, and notes for every trial and window the bonus (before beta) of each visit to
-each pair u. Only pairs that are visited at least `VISITS` times count, so that all visit numbers speak of the same pairs.
+each pair u. Only pairs that are visited at least `VISITS` times count, so that all visit numbers speak of the same pairs. A
+model that has not begun to learn says nothing yet (EX2's waits for 1000 pairs); visits count from where it does.
 """
 
 import contextlib
@@ -45,6 +46,8 @@ def bonuses_of_visits(method, args):
             values, *figures = super().bonus(pairs, *rest)
             (lengths, *_) = rest
             for k, length in enumerate(lengths):
+                if not values[:, k].any():
+                    continue  # nothing has been learnt yet
                 for w in range(pairs.shape[2]):
                     for pair, value in zip(pairs[:length, k, w], values[:length, k, w], strict=True):
                         visits = seen[k, w, pair.tobytes()]

@@ -28,7 +28,7 @@ import torch
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[0] = str(ROOT)  # and not benchmark/, whose statistics.py would hide Python's
+sys.path.insert(0, str(ROOT))
 import envs
 from algos import pg
 from benchmark.speed import print_table

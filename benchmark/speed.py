@@ -103,6 +103,7 @@ def bonus_speed(window, visits=20_000):
 def update_profile(method, env, num_episodes=200):
     """Shares of a run's time that play, the networks' forward and backward pass and the optimiser take."""
     script = importlib.import_module(f"algos.{method}")
+    script_speed(method, env, 20, 2)  # so that loading what is compiled does not count
     seconds = dict.fromkeys(("play", "forward", "backward", "optimiser"), 0.0)
 
     def timed(what, function):
@@ -159,7 +160,7 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
             one, one_rate = script_speed(method, env, 1, episodes)
             many, many_rate = script_speed(method, env, 20, episodes)
             rates[method, env] = many_rate
-            rows.append([method, env, episodes, f"{one:.0f}", f"{one_rate:.0f}", f"{many:.0f}", f"{many_rate:.0f}"])
+            rows.append([method, env, episodes, f"{one:.1f}", f"{one_rate:.0f}", f"{many:.1f}", f"{many_rate:.0f}"])
             rows[-1] += [f"{many_rate / one_rate:.1f}", f"{rates['pg', env] / many_rate:.2f}"]
     head = [
         "script",
@@ -177,7 +178,7 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
     rows = []
     for method, env in product([each for each in methods if each in NOVELTIES], EPISODES):
         base, own = novelty_speed(method, env, EPISODES[env] // (10 if quick else 1))
-        rows.append([method, env, f"{base:.0f}", f"{own:.0f}", f"{own / base:.2f}"])
+        rows.append([method, env, f"{base:.1f}", f"{own:.1f}", f"{own / base:.2f}"])
     head = ["script", "world", "decespg: s", "script: s", "script : decespg"]
     print_table("Other bonuses, for the same episodes (beta 0), 20 trials:", head, rows)
 
