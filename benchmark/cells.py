@@ -5,6 +5,7 @@ import importlib
 import importlib.util
 import json
 import os
+import re
 import sys
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
@@ -142,6 +143,13 @@ class Cell:
         if shapes != {(self.num_trials, self.settings["num_episodes"])}:
             return f"{path} holds arrays of another shape"
         return "" if found == self.settings else f"{run_dir}/args.json is from other settings"
+
+
+def seeds_of(text):
+    """(first, last) of "1-20", or of "1"; None if the text is something else."""
+    found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text)
+    seeds = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    return seeds if seeds[0] <= seeds[1] else None
 
 
 def settings_of(run_dir):

@@ -23,7 +23,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmark import results
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, select
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seeds_of, select
 
 
 @dataclass
@@ -228,13 +228,12 @@ def selection(args):
     for word in args.envs:
         if word not in WORLDS and not (word.endswith(".py") and Path(word).is_file()):
             refuse(f"there is no world {word!r}; there is {', '.join(WORLDS)}, or a file such as my_world.py.")
-    if not (found := re.fullmatch(r"(\d+)(?:-(\d+))?", args.seeds)) or int(found[2] or found[1]) < int(found[1]):
+    if not (seeds := seeds_of(args.seeds)):
         refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
     for name in ("episodes", "jobs"):
         if (value := getattr(args, name)) is not None and value < 1:
             refuse(f"--{name} must be a number of at least 1, not {value}.")
-    first, last = int(found[1]), int(found[2] or found[1])
-    block = dict(first_seed=first, num_trials=last - first + 1, num_episodes=args.episodes, runs=args.runs.absolute())
+    block = dict(first_seed=seeds[0], num_trials=seeds[1] - seeds[0] + 1, num_episodes=args.episodes, runs=args.runs.absolute())
     cells = select(args.algos, args.envs, args.optimizers, **block)
     if not cells:
         refuse("nothing is selected; a method without policies is run under adam only.")

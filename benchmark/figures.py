@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 
 import envs
-from benchmark import statistics
+from benchmark import measures
 from benchmark.cells import OPTIMIZERS, WORLDS, name_of
 from benchmark.results import BLOCK, named_in
 from envs.drawing import AGENTS
@@ -44,7 +44,7 @@ def colour_of(method):
     return COLOURS.get(method) or OTHERS[sum(method.encode()) % len(OTHERS)]
 
 
-def panels(results, methods, ylabel, draw, worlds=None):
+def panels(results, methods, ylabel, draw, worlds=None, xlabel="episode"):
     """A panel for each world and optimiser; draw(axis, world, method, result) draws one method there."""
     there = {world for world, method, _ in results if method in methods}
     worlds = [world for world in worlds or named_in(results)[0] if world in there]
@@ -57,43 +57,86 @@ def panels(results, methods, ylabel, draw, worlds=None):
             for method, result in found.items():
                 draw(axis, world, method, result)
             axis.set_title(f"{Path(world).stem}, {optimizer}", fontsize="medium")
-            axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
+            if axis.get_xscale() == "linear":
+                axis.ticklabel_format(axis="x", style="sci", scilimits=(3, 3))
     figure.supylabel(ylabel, fontsize="medium")
-    figure.supxlabel("episode", fontsize="medium")
-    labels = {label: line for axis in axes.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.supxlabel(xlabel, fontsize="medium")
+    return with_legend(figure, methods)
+
+
+def with_legend(figure, methods):
+    """Name all curves once, beside the panels."""
+    labels = {label: line for axis in figure.axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     names = [name for name in (*(name_of(method) for method in methods), "exact optimum") if name in labels]
     figure.legend([labels[name] for name in names], names, loc="outside right center", frameon=False)
     return figure
 
 
-def line(axis, method, values, error=None):
-    """A curve of block means [blocks], with a band of its error."""
-    episodes, colour = (np.arange(len(values)) + 1) * BLOCK, colour_of(method)
-    axis.plot(episodes, values, DASHES.get(method, "-"), color=colour, label=name_of(method), linewidth=1.3)
+def line(axis, method, xs, values, error=None):
+    """A curve, with a band of its error."""
+    colour = colour_of(method)
+    axis.plot(xs, values, DASHES.get(method, "-"), color=colour, label=name_of(method), linewidth=1.3)
     if error is not None:
-        axis.fill_between(episodes, values - error, values + error, color=colour, alpha=0.2, linewidth=0)
+        axis.fill_between(xs, values - error, values + error, color=colour, alpha=0.2, linewidth=0)
+
+
+def episodes_of(result):
+    """The number of the last episode of each block."""
+    return (np.arange(result.score.shape[1]) + 1) * BLOCK
+
+
+def optimum_line(axis, world):
+    """The exact optimum, under the first curve of a panel."""
+    if not axis.lines:
+        axis.axhline(measures.optimum(world), color="black", linewidth=0.8, linestyle=":", label="exact optimum")
 
 
 def learning_curves(results, methods):
     """The paper's Figures 3, 4 and 6: mean and standard error over trials, the exact optimum as a line."""
 
     def draw(axis, world, method, result):
-        if not axis.lines:
-            axis.axhline(statistics.optimum(world), color="black", linewidth=0.8, linestyle=":", label="exact optimum")
-        line(axis, method, *statistics.mean_and_error(result.score))
+        optimum_line(axis, world)
+        line(axis, method, episodes_of(result), *measures.mean_and_error(result.score))
 
     return panels(results, methods, f"reward per step (mean of {BLOCK} episodes)", draw)
+
+
+def curves_over_steps(results, methods):
+    """The same over environment steps; a trial whose episodes are over keeps its last value, so that all count everywhere."""
+
+    def draw(axis, world, method, result):
+        optimum_line(axis, world)
+        steps = np.geomspace(result.steps[:, 0].max(), result.steps[:, -1].max(), 200)
+        scores = [np.interp(steps, *trial) for trial in zip(result.steps, result.score, strict=True)]
+        axis.set_xscale("log")
+        line(axis, method, steps, *measures.mean_and_error(np.array(scores)))
+
+    return panels(results, methods, "reward per step", draw, xlabel="environment steps of a trial")
 
 
 def share_at_best(results, methods):
     """The share of the trials that end most of 100 episodes in the best outcome."""
 
     def draw(axis, world, method, result):
-        line(axis, method, (result.at_best > 0.5).mean(0))
+        line(axis, method, episodes_of(result), measures.at_best_outcome(result).mean(0))
         axis.set_ylim(-0.03, 1.03)
 
     worlds = [world for world in named_in(results)[0] if envs.make_world(world).outcome_names]
     return panels(results, methods, "share of trials at the best outcome", draw, worlds)
+
+
+def performance_profiles(profiles, shares):
+    """The share of all trials, over worlds, that reach a share of the optimum; {optimiser: {method: (share, low, high)}}."""
+    figure, axes = plt.subplots(1, len(profiles), figsize=(4.6 * len(profiles), 3.4), layout="constrained", squeeze=False)
+    for axis, (optimizer, found) in zip(axes[0], profiles.items(), strict=True):
+        for method, (value, low, high) in found.items():
+            line(axis, method, shares, value)
+            axis.fill_between(shares, low, high, color=colour_of(method), alpha=0.12, linewidth=0)
+        axis.set_title(optimizer, fontsize="medium")
+        axis.grid(alpha=0.3)
+    figure.supxlabel("reward per step / optimum, at least", fontsize="medium")
+    figure.supylabel("share of trials", fontsize="medium")
+    return with_legend(figure, [method for found in profiles.values() for method in found])
 
 
 def intervals(estimates, xlabel):

@@ -1,9 +1,10 @@
-"""Take in finished cells of the comparison; redraw docs/, rewrite the README's tables and make report.html.
+"""Tables and figures of the comparison: report.html, and with --publish docs/, the README's table and what is kept.
 
-    python benchmark/report.py                           # at any time, also half-way
+    python benchmark/report.py                           # at any time, also half-way; writes into runs/report/
+    python benchmark/report.py --episodes 50             # of a smoke run, ./benchmark.sh --episodes 50
 
-report.html holds everything in one file: figures, tables, GIFs of trained teams, settings, versions. Of two results of a cell
-that differ in length only, the longer counts.
+What is finished under runs/ stands beside what is kept in benchmark/results/, which it replaces. Results of different numbers
+of episodes never stand together. report.html holds everything in one file: figures, tables, GIFs of trained teams, settings.
 """
 
 import base64
@@ -11,7 +12,9 @@ import html
 import io
 import sys
 import tempfile
+from dataclasses import dataclass
 from datetime import datetime
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +23,8 @@ from matplotlib import pyplot as plt
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark import figures, results, statistics
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, select
+from benchmark import figures, measures, results
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, seeds_of, select
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -29,16 +32,36 @@ HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-widt
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 1300px; margin: 0 auto; padding: 1rem; }
 h1 { line-height: 1.2; } h2 { margin-top: 2.5rem; border-bottom: 1px solid #ddd; }
-img { max-width: 100%; height: auto; } .wide { overflow-x: auto; } .wide img { min-width: 40rem; }
+img { max-width: 100%; height: auto; } .wide img { min-width: 40rem; }
+.wide { overflow-x: auto; background-repeat: no-repeat; background-size: 3rem 100%, 3rem 100%, 1rem 100%, 1rem 100%;
+  background-image: linear-gradient(90deg, #fff 40%, #fff0), linear-gradient(270deg, #fff 40%, #fff0),
+    linear-gradient(90deg, #0004, #0000), linear-gradient(270deg, #0004, #0000);
+  background-position: left, right, left, right; background-attachment: local, local, scroll, scroll; }
 table { border-collapse: collapse; font-size: 0.85rem; font-variant-numeric: tabular-nums; }
 td, th { padding: 0.2rem 0.6rem; border-bottom: 1px solid #e4e4e4; text-align: left; white-space: nowrap; }
 .teams { display: flex; flex-wrap: wrap; gap: 1rem; } figure { margin: 0; } figcaption { font-size: 0.85rem; }
 """
 
 
+@dataclass
+class Args:
+    runs: Path = RUNS
+    """where the cells have worked"""
+    output_dir: Path | None = None
+    """where figures and report.html go (None: runs/report, beside the cells)"""
+    seeds: str = "1-20"
+    """first and last seed"""
+    episodes: int | None = None
+    """training episodes of each trial (None: Table 1)"""
+    publish: bool = False
+    """keep the results in benchmark/results/ and show them in docs/ and in the README"""
+    scripts: tuple[Path, ...] = ()
+    """files of your own methods, if they are not in algos/"""
+
+
 def score_table(found):
-    """Reward per step over the last 5 % of the episodes of everything that is kept."""
-    rows = [["world", "method", "episodes"]]
+    """Reward per step over the last 5 % of the episodes of all results."""
+    rows = [["world", "method"]]
     for optimizer in OPTIMIZERS:
         rows[0] += [f"{optimizer}: reward per step", "worst trial", "at best end"]
     worlds, methods = results.named_in(found)
@@ -46,12 +69,11 @@ def score_table(found):
         for method in methods:
             pair = [found.get((world, method, optimizer)) for optimizer in OPTIMIZERS]
             if any(pair):
-                lengths = ", ".join(sorted({str(result.num_episodes) for result in pair if result}))
                 words = [word for result in pair for word in scores(world, result)]
-                rows.append([Path(world).stem, name_of(method), lengths, *words])
-        if rows[-1][0] == Path(world).stem and np.isfinite(statistics.optimum(world)):
-            best = f"*{statistics.optimum(world):.2f}*"
-            rows.append([Path(world).stem, "*exact optimum*", "", best, "", "", best, "", ""])
+                rows.append([Path(world).stem, name_of(method), *words])
+        if rows[-1][0] == Path(world).stem and np.isfinite(measures.optimum(world)):
+            best = f"*{measures.optimum(world):.2f}*"
+            rows.append([Path(world).stem, "*exact optimum*", best, "", "", best, "", ""])
     return rows
 
 
@@ -59,10 +81,44 @@ def scores(world, result):
     """The three columns of one result."""
     if result is None:
         return ["", "", ""]
-    mean, error = statistics.mean_and_error(result.last)
+    mean, error = measures.mean_and_error(result.last)
     best = envs.make_world(world)
     count = f"{np.sum(result.usual == best.best_outcome)} of {len(result.usual)}" if best.outcome_names else "-"
     return [f"{mean:.2f} ± {error:.2f}", f"{result.last.min():.2f}", count]
+
+
+def best_table(found):
+    """For each world and optimiser the exact optimum, the method that ends best, and DecESPG and PG beside it."""
+    rows = [["world", "exact optimum", "optimiser", "best", "DecESPG", "PG"]]
+
+    def words(world, method, optimizer):
+        score, _, count = scores(world, found.get((world, method, optimizer)))
+        return f"{score} ({count})" if count.strip("-") else score
+
+    for world, optimizer in product(WORLDS, OPTIMIZERS):
+        ends = {m: result.last.mean() for (w, m, o), result in found.items() if (w, o) == (world, optimizer)}
+        if len(ends) > 2:
+            best = max(ends, key=ends.get)
+            three = [words(world, method, optimizer) for method in (best, "decespg", "pg")]
+            rows.append([world, f"{measures.optimum(world):.2f}", optimizer, f"{name_of(best)} {three[0]}", *three[1:]])
+    return rows
+
+
+def leaderboard(found):
+    """Episodes, and environment steps of a trial, until 95 % of the trials are at the best outcome, and near the optimum.
+
+    In each world first who needs the fewest steps to come near the optimum, then who needs the fewest to the best outcome.
+    """
+    rows, worlds = [], results.named_in(found)[0]
+    for (world, method, optimizer), result in found.items():
+        goods = measures.at_best_outcome(result), measures.near_optimum(result, world)
+        points = [measures.reached(result, good) for good in goods]
+        if any(points):
+            place = worlds.index(world), *(point[1] if point else np.inf for point in reversed(points))
+            words = [word for point in points for word in ([str(point[0]), f"{point[1]:,.0f}"] if point else ["-", "-"])]
+            rows.append((place, [Path(world).stem, name_of(method), optimizer, *words]))
+    head = ["world", "method", "optimiser", "best outcome: episodes", "steps", "within 5 % of the optimum: episodes", "steps"]
+    return [head, *(row for _, row in sorted(rows))]
 
 
 def difference_table(found, one="decespg", other="spg"):
@@ -71,7 +127,7 @@ def difference_table(found, one="decespg", other="spg"):
     for world in WORLDS:
         pairs = [[found.get((world, method, optimizer)) for method in (one, other)] for optimizer in OPTIMIZERS]
         if any(all(pair) for pair in pairs):
-            words = ["{:+.2f} [{:+.2f}, {:+.2f}]".format(*statistics.difference(*pair)) if all(pair) else "" for pair in pairs]
+            words = ["{:+.2f} [{:+.2f}, {:+.2f}]".format(*measures.difference(*pair)) if all(pair) else "" for pair in pairs]
             rows.append([world, *words])
     return rows
 
@@ -120,17 +176,26 @@ def all_figures(found):
         own = [method for method in methods if method not in ("pg", "espg", "decespg")]
         if any(method in own for _, method, _ in found):
             drawn[name] = figures.learning_curves(found, methods)
+            drawn[f"{name}-steps"] = figures.curves_over_steps(found, methods)
             drawn[f"{name}-best"] = figures.share_at_best(found, methods)
     if any(len(result.actions) for result in found.values()):
         drawn["figure5"] = figures.trajectories(found)
-    worlds = ("findtreasure", "pushbox")  # where every method has all its episodes
-    shares = {optimizer: statistics.scores_over_worlds(found, optimizer, worlds) for optimizer in OPTIMIZERS}
-    if all("decespg" in methods and len(methods) > 1 for methods in shares.values()):
-        means = {optimizer: statistics.interquartile_means(scores) for optimizer, scores in shares.items()}
+    if worlds := worlds_of_all(found):
+        scores = {optimizer: measures.scores_over_worlds(found, optimizer, worlds) for optimizer in OPTIMIZERS}
+        means = {optimizer: measures.interquartile_means(values) for optimizer, values in scores.items()}
         drawn["iqm"] = figures.intervals(means, "interquartile mean of reward per step / optimum")
-        better = {optimizer: statistics.improvements(scores) for optimizer, scores in shares.items()}
+        better = {optimizer: measures.improvements(values) for optimizer, values in scores.items()}
         drawn["improvement"] = figures.intervals(better, "probability that DecESPG's trial is better")
+        shares = np.linspace(0, 1, 101)
+        profiles = {optimizer: measures.profiles(values, shares) for optimizer, values in scores.items()}
+        drawn["profiles"] = figures.performance_profiles(profiles, shares)
     return drawn
+
+
+def worlds_of_all(found):
+    """The worlds in which every method of the paper has a result under both optimisers."""
+    cells = {world: select(METHODS, [world], OPTIMIZERS) for world in WORLDS}
+    return [world for world in WORLDS if all((world, cell.method, cell.optimizer) in found for cell in cells[world])]
 
 
 def markdown(rows):
@@ -180,12 +245,17 @@ def team_films(found, methods=("pg", "decespg"), optimizer="sign", longest=200):
 
 
 CAPTIONS = {
-    "figure3": "Figure 3: the baselines. Mean and standard error over 20 trials.",
-    "figure4": "Figure 4: the ablation, what bonus and memory do by themselves.",
-    "figure6": "Figure 6: single components exchanged.",
-    "figure5": "Figure 5: ways of trained teams (first trial, sign), from the rings on.",
-    "iqm": "Interquartile mean over FindTreasure and PushBox, 95 % stratified bootstrap intervals (rliable).",
-    "improvement": "Probability that a trial of DecESPG ends better than one of the method, over both worlds (0.5: none).",
+    "figure3": "Figure 3: the baselines. Mean and standard error over the trials",
+    "figure4": "Figure 4: the ablation, what bonus and memory do by themselves",
+    "figure6": "Figure 6: single components exchanged",
+    "figure5": "Figure 5: ways of trained teams (first trial, sign), from the rings on",
+    "iqm": "Interquartile mean, 95 % stratified bootstrap intervals (rliable)",
+    "improvement": "Probability that a trial of DecESPG ends better than one of the method (0.5: no difference)",
+    "profiles": "Performance profiles: the share of the trials that reach a share of the optimum",
+}
+MORE = {
+    "-steps": "The same over environment steps.",
+    "-best": "The share of the trials that end most of 100 episodes in the best outcome.",
 }
 
 
@@ -193,51 +263,73 @@ def page(found, drawn):
     """report.html."""
     parts = ["<h1>Cooperative multi-agent exploration: the comparison</h1>"]
     cells, hours = select(METHODS, WORLDS, OPTIMIZERS), whole_comparison_hours(found)
-    there = f"{len(found)} of {len(cells)} cells of 20 trials are there"
+    there = f"{len(found)} of {len(cells)} cells are there"
     parts.append(f"<p>{datetime.now():%Y-%m-%d}: {there}, made with {versions(found)}. ")
     parts.append(f"All of them at Table 1's episodes take about {hours:.0f} hours on two cores.</p>")
     parts += ["<h2>Reward per step, last 5 % of the episodes</h2>", html_table(score_table(found))]
-    parts += ["<h3>DecESPG minus SPG: what the bonus adds to the memory</h3>", html_table(difference_table(found))]
+    parts += ["<h2>DecESPG minus SPG: what the bonus adds to the memory</h2>", html_table(difference_table(found))]
+    parts += ["<h2>Sample efficiency: until 95 % of the trials are there</h2>", html_table(leaderboard(found))]
     for name, figure in drawn.items():
-        caption = CAPTIONS.get(name, "Share of the trials that end most of 100 episodes in the best outcome.")
-        parts += [f"<h2>{caption}</h2>" if name in CAPTIONS else f"<p>{caption}</p>", svg(figure, caption)]
+        base, dash, more = name.partition("-")
+        caption = MORE[dash + more] if more else CAPTIONS[base]
+        parts += [f"<p>{caption}</p>" if more else f"<h2>{caption}</h2>", svg(figure, caption)]
     parts += ["<h2>Trained teams</h2>", team_films(found)]
     parts += ["<h2>Cells</h2>", html_table(cell_table(found)), "<h2>Settings</h2>", html_table(settings_table())]
     return f"<!doctype html><html lang=en><head>{HEAD}<style>{STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
 
 
-def rewrite(readme, name, text):
-    """Put a table between the marks <!-- name --> and <!-- end name --> of the README."""
+def rewrite(text, name, table):
+    """Put a table between the marks <!-- name --> and <!-- end name --> of a text."""
     marks = f"<!-- {name} -->", f"<!-- end {name} -->"
-    before, _, rest = readme.partition(marks[0])
+    before, _, rest = text.partition(marks[0])
     _, _, after = rest.partition(marks[1])
-    return f"{before}{marks[0]}\n{text}\n{marks[1]}{after}"
+    return f"{before}{marks[0]}\n{table}\n{marks[1]}{after}"
 
 
-def main(runs: Path = RUNS, output: Path = Path("report.html"), scripts: tuple[Path, ...] = ()):
-    """Take in new runs, redraw, rewrite.
-
-    Args:
-        runs: where the cells have worked
-        output: the page
-        scripts: files of your own methods, if they are not in algos/
-    """
-    results.take_in(runs, tuple(map(str, scripts)))
-    found = results.kept()
-    if not found:
-        print("report.py: there is no result yet; ./benchmark.sh makes some.", file=sys.stderr)
-        sys.exit(2)
-    drawn = all_figures(found)
+def publish(found, drawn):
+    """Show results in docs/ and in the README."""
     for name, figure in drawn.items():
         figure.savefig(DOCS / f"{name}.png", dpi=130)
-    with envs.complete_file(output) as file:
+    tables = dict(scores=score_table, differences=difference_table, leaderboard=leaderboard)
+    for path, names in ((README, {"best": best_table}), (DOCS / "results.md", tables)):
+        text = path.read_text(encoding="utf-8")
+        for name, table in names.items():
+            text = rewrite(text, name, markdown(table(found)))
+        path.write_text(text, encoding="utf-8")
+
+
+def refuse(message):
+    """End with one sentence and code 2."""
+    print(f"report.py: {message}", file=sys.stderr)
+    sys.exit(2)
+
+
+def main(args: Args):
+    """Read what is finished, draw, write."""
+    if not (seeds := seeds_of(args.seeds)):
+        refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
+    ours = seeds == (1, 20) and args.episodes is None
+    if args.publish and not ours:
+        refuse("only results of seeds 1-20 and all of Table 1's episodes are published.")
+    fresh = results.finished(args.runs, seeds, args.episodes, tuple(map(str, args.scripts)))
+    if args.publish:
+        results.keep(fresh)
+    found = results.in_order({**results.kept(), **fresh} if ours else fresh)
+    if not found:
+        refuse(f"there is no finished cell under {args.runs}; ./benchmark.sh makes some.")
+    drawn = all_figures(found)
+    output_dir = args.output_dir or args.runs.parent / "report"
+    output_dir.mkdir(parents=True, exist_ok=True)
+    for name, figure in drawn.items():
+        figure.savefig(output_dir / f"{name}.png", dpi=130)
+    with envs.complete_file(output_dir / "report.html") as file:
         file.write(page(found, drawn).encode())
+    if args.publish:
+        publish(found, drawn)
     plt.close("all")
-    readme = rewrite(README.read_text(), "scores", markdown(score_table(found)))
-    README.write_text(rewrite(readme, "differences", markdown(difference_table(found))))
-    print(markdown(score_table(found)), markdown(difference_table(found)), sep="\n\n")
-    print(f"\nAll cells at Table 1's episodes: about {whole_comparison_hours(found):.1f} hours on two cores. See {output}.")
+    print(markdown(score_table(found)), markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")
+    print(f"\nAll cells at Table 1's episodes: about {whole_comparison_hours(found):.1f} hours on two cores. See {output_dir}.")
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Args, description=__doc__))

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,42 +19,51 @@ BLOCK = 100  # episodes of which a point of a curve is the mean
 
 @dataclass(frozen=True)
 class Result:
-    """What is kept of a run of several trials."""
+    """What is kept of the trials of a method in a world."""
 
     score: np.ndarray  # [num_trials, num_episodes / BLOCK] reward per step, mean of each block
     at_best: np.ndarray  # shaped as score, share of the episodes that ended in the best outcome
+    steps: np.ndarray  # shaped as score, environment steps from the first episode to the end of each block
     last: np.ndarray  # [num_trials] reward per step, mean of the last 5 % of the episodes
-    usual: np.ndarray  # [num_trials] the outcome in which most of the last 5 % of the episodes ended
+    usual: np.ndarray  # [num_trials] the outcome in which more of the last 5 % of the episodes ended than in any other
     actions: np.ndarray  # [T, num_agents] an episode of the first trial's trained team; T is 0 if the team was not saved
     seconds: float  # that the run took; nan if nobody has timed it
     num_episodes: int
     about: dict  # args.json but for what does not concern the result, such as directories
 
     @classmethod
-    def of_run(cls, run_dir, method=None):
-        """Read a finished run's directory; method: its script, unless it is one of algos/."""
-        about = json.loads((run_dir / "args.json").read_text())
-        about["args"] = {name: value for name, value in about["args"].items() if name not in run.HOUSEKEEPING}
-        world = envs.make_world(about["args"]["env"])
-        with np.load(run_dir / "episodes.npz") as episodes:
-            log = envs.EpisodeLog(world, *episodes["returns"].shape)
-            log.returns, log.lengths, log.outcomes = (episodes[name] for name in ("returns", "lengths", "outcomes"))
-        trials, num_episodes = log.returns.shape
+    def of_runs(cls, run_dirs, method=None):
+        """Put the directories of finished runs, blocks of seeds in their order, together.
+
+        method: their script, unless it is one of algos/
+        """
+        abouts = [json.loads((run_dir / "args.json").read_text()) for run_dir in run_dirs]
+        args = {name: value for name, value in abouts[0]["args"].items() if name not in run.HOUSEKEEPING}
+        world = envs.make_world(args["env"])
+        blocks_of_seeds = [np.load(run_dir / "episodes.npz") for run_dir in run_dirs]
+        returns, lengths, outcomes = (
+            np.concatenate([block[name] for block in blocks_of_seeds]) for name in ("returns", "lengths", "outcomes")
+        )
+        log = envs.EpisodeLog(world, *returns.shape)
+        log.returns, log.lengths, log.outcomes = returns, lengths, outcomes
+        trials, num_episodes = returns.shape
         blocks, recent = num_episodes // BLOCK, slice(-max(1, num_episodes // 20), None)
 
-        def block_means(values):
-            return values[:, : blocks * BLOCK].reshape(trials, blocks, BLOCK).mean(2).astype(np.float32)
+        def in_blocks(values):
+            return values[:, : blocks * BLOCK].reshape(trials, blocks, BLOCK)
 
-        timed = run_dir / "seconds"
+        commits = sorted({about.get("commit", "") for about in abouts})
+        seconds = [float(text.read_text()) for run_dir in run_dirs if (text := run_dir / "seconds").exists()]
         return cls(
-            score=block_means(envs.reward_per_step(log.returns, log.lengths)),
-            at_best=block_means(log.outcomes == (world.best_outcome if world.outcome_names else -1)),
+            score=in_blocks(envs.reward_per_step(returns, lengths)).mean(2).astype(np.float32),
+            at_best=in_blocks(outcomes == (world.best_outcome if world.outcome_names else -1)).mean(2).astype(np.float32),
+            steps=in_blocks(lengths).sum(2).cumsum(1),
             last=log.means(recent)["reward_per_step"],
             usual=log.usual_outcomes(recent),
-            actions=sample_episode(method or about["method"], run_dir / "policy.pt", world.num_agents),
-            seconds=float(timed.read_text()) if timed.exists() else float("nan"),
+            actions=sample_episode(method or abouts[0]["method"], run_dirs[0] / "policy.pt", world.num_agents),
+            seconds=sum(seconds) if len(seconds) == len(run_dirs) else float("nan"),
             num_episodes=num_episodes,
-            about=about,
+            about={**abouts[0], "commit": " and ".join(commits), "args": {**args, "num_trials": trials}},
         )
 
     @classmethod
@@ -75,11 +85,10 @@ def sample_episode(method, policy_file, num_agents):
     """The joint actions [T, num_agents] of an episode that the first team of a policy.pt plays; T is 0 if there is no file."""
     if not policy_file.exists():
         return np.zeros((0, num_agents), np.int8)
-    _, world, team = run.load(policy_file, script(method))
-    rollout = envs.Rollout(world, 1, head=getattr(team.policy, "head", envs.softmax))
-    first = [param[:num_agents] for param in team.policy.params]
-    rollout.play(first, [np.random.default_rng(1)], getattr(team.policy, "parameter", 1.0))
-    return rollout.actions[:, 0].astype(np.int8)
+    args, world, team = run.load(policy_file, script(method))
+    rollout = envs.Rollout(world, args.num_trials, head=getattr(team.policy, "head", envs.softmax))
+    run.play_episode(rollout, team.policy, [np.random.default_rng(seed) for seed in range(1, args.num_trials + 1)])
+    return rollout.actions[: rollout.lengths[0], 0].astype(np.int8)
 
 
 def load(path):
@@ -91,36 +100,53 @@ def load(path):
         return None
 
 
-def take_in(runs, scripts=()):
-    """Keep the finished cells of the comparison that lie under `runs` and are not shorter than what is kept already.
+def finished(runs, seeds=(1, 20), num_episodes=None, scripts=()):
+    """{(world, method, optimizer): Result} of the comparison's finished cells under `runs`, in the order of the tables.
 
+    seeds: the first and the last; a cell may have been run in blocks of them
+    num_episodes: of each trial (None: Table 1)
     scripts: files of methods outside algos/
     """
     methods = {path_of(method).stem: method for method in (*(path.stem for path in (ROOT / "algos").glob("*.py")), *scripts)}
+    blocks = defaultdict(dict)
     for file in sorted(runs.rglob("episodes.npz")):
         try:
             found = settings_of(file.parent)
-        except Exception as error:  # whatever can be wrong with a file
-            print(f"{file.parent} cannot be read ({type(error).__name__}) and is left out.", file=sys.stderr)
-            continue
-        if (found["seed"], found["num_trials"]) != (1, 20) or found["method"] not in methods:
-            continue
-        method, optimizer = methods[found["method"]], found.get("optimizer", "adam")
-        try:
-            cell = Cell(method, found["env"], optimizer, num_episodes=found["num_episodes"])
+            if found["method"] not in methods:
+                continue
+            method, optimizer = methods[found["method"]], found.get("optimizer", "adam")
+            cell = Cell(method, found["env"], optimizer, found["seed"], found["num_trials"], num_episodes)
             own = cell.settings == found  # not somebody's experiment, nor from before a change of the defaults
         except envs.UsageError as error:  # a world that is there no more
             print(f"{file.parent} is left out: {error}", file=sys.stderr)
             continue
-        if not own:
+        except Exception as error:  # whatever can be wrong with a file
+            print(f"{file.parent} cannot be read ({type(error).__name__}) and is left out.", file=sys.stderr)
             continue
-        if broken := cell.what_is_wrong(file.parent):
+        if own and (broken := cell.what_is_wrong(file.parent)):
             print(f"{broken} and is left out.", file=sys.stderr)
-            continue
-        path = STORE / Path(cell.world).stem / f"{found['method']}-{optimizer}.npz"
-        before = load(path)
-        if before is None or before.num_episodes <= cell.settings["num_episodes"]:
-            Result.of_run(file.parent, method).save(path)
+        elif own:
+            blocks[found["env"], found["method"], optimizer][found["seed"], found["seed"] + found["num_trials"]] = file.parent
+    wholes = {key: cover(parts, seeds[0], seeds[1] + 1) for key, parts in blocks.items()}
+    return in_order({key: Result.of_runs(parts, methods[key[1]]) for key, parts in wholes.items() if parts})
+
+
+def cover(parts, first, end):
+    """Those of {(first seed, the seed after the last): directory} that follow each other from `first` to `end`, or nothing."""
+    chosen = []
+    while first != end:
+        block = max((block for block in parts if block[0] == first and block[1] <= end), default=None)
+        if block is None:
+            return []
+        chosen.append(parts[block])
+        first = block[1]
+    return chosen
+
+
+def keep(found):
+    """Write results into benchmark/results/."""
+    for (world, method, optimizer), result in found.items():
+        result.save(STORE / Path(world).stem / f"{method}-{optimizer}.npz")
 
 
 def kept():
@@ -129,6 +155,11 @@ def kept():
     for result in filter(None, map(load, sorted(STORE.rglob("*.npz")))):
         args = result.about["args"]
         found[args["env"], result.about["method"], args.get("optimizer", "adam")] = result
+    return in_order(found)
+
+
+def in_order(found):
+    """Results in the order of the tables, those of other worlds and methods last."""
 
     def place(key):
         orders = list(WORLDS), list(METHODS), list(OPTIMIZERS)

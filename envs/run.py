@@ -391,6 +391,14 @@ def say(line):
         raise envs.UsageError(f"cannot write to standard output: {error.strerror}.") from error
 
 
+def play_episode(rollout, policy, generators):
+    """Play an episode of every trial with stacked networks, or with the `player` of a policy that is something else."""
+    if hasattr(policy, "player"):
+        rollout.play_with(policy.player(), generators)
+    else:
+        rollout.play(policy.params, generators, getattr(policy, "parameter", 1.0))
+
+
 def play_teams(args, world, team, num_episodes, video):
     """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
     policy, teams = team.policy, args.num_trials
@@ -398,10 +406,7 @@ def play_teams(args, world, team, num_episodes, video):
     generators = [np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(teams)]
     log, frames = envs.EpisodeLog(world, teams, num_episodes), []
     for episode in range(num_episodes):
-        if hasattr(policy, "player"):
-            rollout.play_with(policy.player(), generators)
-        else:
-            rollout.play(policy.params, generators, getattr(policy, "parameter", 1.0))
+        play_episode(rollout, policy, generators)
         log.add(episode, rollout.reward[:, :, 0], rollout.lengths, rollout.outcomes)
         if episode == 0:
             rewards = ["start", *(f"step {t + 1}   reward {rollout.reward[t, 0, 0]:+g}" for t in range(rollout.lengths[0]))]

@@ -182,16 +182,14 @@ def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, ca
     text = (ROOT / "algos" / "pg.py").read_text()
     (tmp_path / "mine.py").write_text(text.replace("str(Path(__file__).resolve().parents[1])", repr(str(ROOT))))
     world = ROOT / "tests" / "data" / "race.py"
-    store, words = tmp_path / "store", ["--algos", tmp_path / "mine.py", "--envs", world, "--optimizers", "sign"]
-    monkeypatch.setattr(results, "STORE", store)
+    words = ["--algos", tmp_path / "mine.py", "--envs", world, "--optimizers", "sign"]
     code, said, _ = command(monkeypatch, capsys, *words, "--episodes", 100, "--runs", tmp_path / "runs")
     assert (code, "1 finished, 0 failed" in said) == (0, True), said
-    results.take_in(tmp_path / "runs", [str(tmp_path / "mine.py")])
-    kept = results.kept()
-    assert list(kept) == [(str(world), "mine", "sign")]
-    assert kept[str(world), "mine", "sign"].actions.any()
-    assert [row[:3] for row in report.score_table(kept)][1] == ["race", "mine", "100"]
-    drawn = figures.learning_curves(kept, results.named_in(kept)[1])
+    found = results.finished(tmp_path / "runs", num_episodes=100, scripts=[str(tmp_path / "mine.py")])
+    assert list(found) == [(str(world), "mine", "sign")]
+    assert found[str(world), "mine", "sign"].actions.any()
+    assert report.score_table(found)[1][:2] == ["race", "mine"]
+    drawn = figures.learning_curves(found, results.named_in(found)[1])
     assert [axis.get_title() for axis in drawn.axes] == ["race, sign", "race, adam"]
 
 

@@ -1,13 +1,14 @@
 """benchmark/report.py: the figures, the page, and the tables in the README."""
 
+import dataclasses
 import re
 
 import numpy as np
 import pytest
 
 from benchmark import figures, report, results
-from benchmark.cells import METHODS
-from tests.helpers import BEST_PLANS
+from benchmark.cells import METHODS, Cell
+from tests.helpers import BEST_PLANS, script, train
 
 
 @pytest.fixture(scope="module")
@@ -22,11 +23,31 @@ def test_tables_are_written_between_their_marks():
     assert report.rewrite(once, "scores", "new") == once
 
 
-def test_the_readmes_tables_are_those_of_the_kept_results(kept):
-    assert len(kept) >= 26
-    readme = report.README.read_text()
-    assert report.markdown(report.score_table(kept)) in readme
-    assert report.markdown(report.difference_table(kept)) in readme
+def test_the_published_tables_are_those_of_the_kept_results(kept):
+    assert len(kept) >= 54
+    assert {result.num_episodes for result in kept.values()} == {10_000, 20_000}
+    assert all(len(result.about["commit"]) == 40 for result in kept.values())
+    assert report.markdown(report.best_table(kept)) in report.README.read_text()
+    text = (report.DOCS / "results.md").read_text()
+    for table in (report.score_table, report.difference_table, report.leaderboard):
+        assert report.markdown(table(kept)) in text
+
+
+def test_the_leaderboard_counts_until_95_percent_are_there(kept):
+    key = "pushbox", "decespg", "sign"
+    head, row = report.leaderboard({key: kept[key]})
+    block = np.flatnonzero((kept[key].at_best > 0.5).sum(0) >= 19)[0]
+    assert row[:4] == ["pushbox", "DecESPG", "sign", str(100 * (block + 1))]
+    assert row[4] == f"{kept[key].steps[:, block].mean():,.0f}"
+    assert len(head) == len(row)
+
+
+def test_the_best_of_each_world_is_named(kept):
+    few = {key: kept[key] for key in [("pushbox", m, "sign") for m in ("pg", "spg", "decespg")]}
+    few["pushbox", "spg", "sign"] = dataclasses.replace(few["pushbox", "spg", "sign"], last=np.full(20, 33.0))
+    _, row = report.best_table(few)
+    assert row[:4] == ["pushbox", "33.33", "sign", "SPG 33.00 ± 0.00 (20 of 20)"]
+    assert row[4].endswith("(20 of 20)")
 
 
 def test_every_method_has_its_own_look():
@@ -75,10 +96,37 @@ def test_the_page_holds_everything_in_one_file(kept):
     assert "learning_rate 0.0001" in page
 
 
-def test_without_results_it_says_so(tmp_path, monkeypatch, capsys):
+def test_a_smoke_run_has_a_report_of_its_own(tmp_path, monkeypatch, capsys):
+    """Where nothing is published: neither what is kept nor README and docs/ change, and nothing longer stands beside it."""
+    paths = [report.README, *report.DOCS.iterdir()]
+    before = [path.read_bytes() for path in paths]
+    monkeypatch.setattr(results, "STORE", tmp_path / "store")
+    for method in ("pg", "spg", "decespg"):
+        cell = Cell(method, "pushbox", "sign", num_trials=2, num_episodes=100, runs=tmp_path / "runs")
+        train(script(method), cell.run_dir, **cell.arguments)
+    capsys.readouterr()
+    report.main(report.Args(runs=tmp_path / "runs", episodes=100, seeds="1-2"))
+    said = capsys.readouterr().out
+    assert said.count("| pushbox | ") == 4 + 1  # methods and optimum, and the difference
+    assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
+    assert (tmp_path / "report" / "figure4.png").exists()
+    assert [path.read_bytes() for path in paths] == before
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (dict(), "there is no finished cell under "),
+        (dict(publish=True, episodes=50), "only results of seeds 1-20 and all of Table 1's episodes are published."),
+        (dict(publish=True, seeds="1-3"), "only results of seeds 1-20 and all of Table 1's episodes are published."),
+        (dict(seeds="3-1"), "--seeds must be two numbers such as 1-20, not '3-1'."),
+    ],
+)
+def test_what_cannot_be_reported(args, said, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(results, "STORE", tmp_path / "store")
     with pytest.raises(SystemExit) as error:
-        report.main(runs=tmp_path, output=tmp_path / "report.html")
+        report.main(report.Args(runs=tmp_path, output_dir=tmp_path / "report", **args))
     assert error.value.code == 2
-    assert capsys.readouterr().err == "report.py: there is no result yet; ./benchmark.sh makes some.\n"
-    assert not (tmp_path / "report.html").exists()
+    assert capsys.readouterr().err.startswith(f"report.py: {said}")
+    assert not (tmp_path / "report").exists()

@@ -9,7 +9,7 @@ import pytest
 
 import envs
 from algos import pg
-from benchmark import results, statistics
+from benchmark import measures, results
 from benchmark.cells import Cell
 from benchmark.results import Result
 from tests.helpers import script, train
@@ -41,7 +41,7 @@ def some_run(runs, num_episodes=250, **changed):
 
 def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     folder, returns, lengths, outcomes = some_run(tmp_path)
-    result = Result.of_run(folder)
+    result = Result.of_runs([folder])
     score = returns / np.maximum(lengths - 1, 1)
     best = envs.make_world("pushbox").best_outcome
     assert result.score.shape == result.at_best.shape == (20, 2)
@@ -52,66 +52,83 @@ def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     assert (result.num_episodes, result.seconds) == (250, 12.5)
     assert result.about["args"]["learning_rate"] == Cell("pg", "pushbox", "adam").settings["learning_rate"]
     assert "run_dir" not in result.about["args"]
+    assert result.steps[7].tolist() == [lengths[7, :100].sum(), lengths[7, :200].sum()]
 
 
 def test_a_result_is_loaded_as_it_was_saved(tmp_path):
-    result = Result.of_run(some_run(tmp_path)[0])
+    result = Result.of_runs([some_run(tmp_path)[0]])
     result.save(tmp_path / "kept" / "pg-adam.npz")
     again = Result.load(tmp_path / "kept" / "pg-adam.npz")
     for name, value in vars(result).items():
         assert np.array_equal(value, getattr(again, name))
 
 
-def test_only_the_comparisons_own_runs_are_taken_in(tmp_path, store):
+def test_only_the_comparisons_own_runs_are_found(tmp_path):
     some_run(tmp_path / "gamma", gamma=0.5)
     some_run(tmp_path / "seed", seed=2)
-    results.take_in(tmp_path)
-    assert not store.exists()
+    some_run(tmp_path / "longer", num_episodes=300)
+    assert results.finished(tmp_path, num_episodes=250) == {}
     some_run(tmp_path / "own")
-    results.take_in(tmp_path)
-    assert [path.relative_to(store).as_posix() for path in store.rglob("*.npz")] == ["pushbox/pg-adam.npz"]
+    found = results.finished(tmp_path, num_episodes=250)
+    assert {key: result.num_episodes for key, result in found.items()} == {("pushbox", "pg", "adam"): 250}
+    assert results.finished(tmp_path) == {}  # Table 1's number of episodes
+    assert results.finished(tmp_path, seeds=(1, 3), num_episodes=250) == {}
 
 
-def test_the_longer_run_counts(tmp_path, store):
-    for runs, kept in (("some", 250), ("more", 300), ("fewer", 300)):
-        some_run(tmp_path / runs, num_episodes={"some": 250, "more": 300, "fewer": 200}[runs])
-        results.take_in(tmp_path / runs)
-        assert Result.load(store / "pushbox" / "pg-adam.npz").num_episodes == kept
+def test_a_result_is_put_together_from_blocks_of_seeds(tmp_path):
+    whole, returns, lengths, outcomes = some_run(tmp_path / "whole")
+    expected, parts = Result.of_runs([whole]), tmp_path / "parts"
+    for first, end in ((1, 6), (6, 15), (15, 21)):
+        assert results.finished(parts, num_episodes=250) == {}
+        cell, block = Cell("pg", "pushbox", "adam", first, end - first, num_episodes=250), slice(first - 1, end - 1)
+        folder = write_run(cell, parts / str(first), returns[block], lengths[block], outcomes[block])
+        about = json.loads((folder / "args.json").read_text())
+        (folder / "args.json").write_text(json.dumps({**about, "commit": "b" if first == 6 else "a"}))
+    ((_, result),) = results.finished(parts, num_episodes=250).items()
+    for name in ("score", "at_best", "steps", "last", "usual"):
+        assert np.array_equal(getattr(result, name), getattr(expected, name))
+    assert (result.seconds, result.about["commit"], result.about["args"]["num_trials"]) == (37.5, "a and b", 20)
+
+
+def test_blocks_that_overlap_or_leave_a_gap_are_none():
+    def cover(*blocks):
+        return results.cover({block: str(block) for block in blocks}, 1, 21)
+
+    assert cover((1, 11), (11, 21)) == ["(1, 11)", "(11, 21)"]
+    assert cover((1, 21), (1, 11), (11, 21), (5, 8)) == ["(1, 21)"]
+    assert cover((1, 11), (12, 21)) == cover((1, 11), (10, 21)) == cover((1, 22)) == cover((2, 21)) == []
 
 
 def test_what_is_broken_is_named_and_left_out(tmp_path, store, capsys):
-    results.take_in(tmp_path / "none")
     whole = some_run(tmp_path / "whole")[0]
     half = tmp_path / "half"
     shutil.copytree(whole, half)
     (half / "episodes.npz").write_bytes(b"half")
-    results.take_in(half)
+    assert results.finished(half, num_episodes=250) == {}
     assert "half/episodes.npz cannot be read" in capsys.readouterr().err
     (half / "args.json").write_text("{")
-    results.take_in(half)
+    assert results.finished(half, num_episodes=250) == {}
     assert "half cannot be read" in capsys.readouterr().err
-    assert not store.exists()
-    results.take_in(whole)
+    results.keep(results.finished(whole, num_episodes=250))
+    assert list(results.kept()) == [("pushbox", "pg", "adam")]
     kept = store / "pushbox" / "pg-adam.npz"
     kept.write_bytes(kept.read_bytes()[:-40])
     assert results.kept() == {}
     assert f"{kept} cannot be read" in capsys.readouterr().err
-    results.take_in(whole)
-    assert list(results.kept()) == [("pushbox", "pg", "adam")]
 
 
 def test_an_episode_of_the_first_team_is_kept(tmp_path):
     args = dict(env="findtreasure", seed=1, num_trials=2, num_episodes=400, learning_rate=3e-3, save_model=True)
     log = train(pg, tmp_path, **args).log
-    world, actions = log.world, Result.of_run(tmp_path).actions
-    assert Result.of_run(tmp_path).actions.tolist() == actions.tolist()
+    world, actions = log.world, Result.of_runs([tmp_path]).actions
+    assert Result.of_runs([tmp_path]).actions.tolist() == actions.tolist()
     state, outcome = world.start.copy(), 0
     for step, joint in enumerate(actions.astype(np.int64)):
         assert outcome == 0, step
         _, outcome = world.step(world.rules, state, joint)
     assert outcome == log.usual_outcomes(slice(-20, None))[0] > 0
     (tmp_path / "policy.pt").unlink()
-    assert Result.of_run(tmp_path).actions.shape == (0, 2)
+    assert Result.of_runs([tmp_path]).actions.shape == (0, 2)
 
 
 def some_result(last, **values):
@@ -121,17 +138,27 @@ def some_result(last, **values):
 
 def test_a_difference_is_that_of_the_same_seeds():
     noise = np.random.default_rng(0).normal(size=20)
-    assert statistics.difference(some_result(noise * 100 + 2), some_result(noise * 100)) == pytest.approx((2, 2, 2))
-    mean, low, high = statistics.difference(some_result(noise), some_result(np.zeros(20)))
+    assert measures.difference(some_result(noise * 100 + 2), some_result(noise * 100)) == pytest.approx((2, 2, 2))
+    mean, low, high = measures.difference(some_result(noise), some_result(np.zeros(20)))
     assert mean == noise.mean()
     error = noise.std(ddof=1) / np.sqrt(20)
     assert (low, high) == pytest.approx((mean - 1.96 * error, mean + 1.96 * error), abs=0.15)
 
 
+def test_when_most_trials_are_good_is_the_end_of_the_first_such_block():
+    good = np.zeros((20, 4), bool)
+    good[:18, 1], good[:19, 2], good[:, 3] = True, True, True
+    result = some_result(np.zeros(20), steps=np.arange(80).reshape(20, 4))
+    assert measures.reached(result, good) == (300, result.steps[:, 2].mean())
+    assert measures.reached(result, good[:, :2]) is None
+    score = np.array([[0.949, 0.951], [0.96, 0.94]]) * 100 / 3
+    assert measures.near_optimum(some_result([0], score=score), "pushbox").tolist() == [[False, True], [True, False]]
+
+
 def test_scores_are_shares_of_the_optimum_where_a_method_has_all_worlds():
     found = {("findtreasure", "pg", "sign"): some_result([1, 2]), ("pushbox", "pg", "sign"): some_result([100 / 3, 50 / 3])}
     found["pushbox", "spg", "sign"] = some_result([1, 1])
-    shares = statistics.scores_over_worlds(found, "sign", ("findtreasure", "pushbox"))
+    shares = measures.scores_over_worlds(found, "sign", ("findtreasure", "pushbox"))
     assert list(shares) == ["pg"]
     assert shares["pg"] == pytest.approx(np.array([[7 / 100, 1], [14 / 100, 0.5]]))
 
@@ -139,14 +166,14 @@ def test_scores_are_shares_of_the_optimum_where_a_method_has_all_worlds():
 def test_interquartile_means_leave_the_outer_quarters_out():
     scores = np.arange(40.0).reshape(20, 2)
     scores[-1] = 1e6
-    assert statistics.interquartile_means({"pg": scores})["pg"][0] == pytest.approx(np.arange(10, 30).mean())
+    assert measures.interquartile_means({"pg": scores})["pg"][0] == pytest.approx(np.arange(10, 30).mean())
 
 
 def test_intervals_are_seeded_and_leave_the_global_generator_alone():
     scores = {"pg": np.random.default_rng(1).normal(size=(20, 2)), "decespg": np.random.default_rng(2).normal(size=(20, 2))}
     before = np.random.get_state()[1].tolist()  # noqa: NPY002
-    first = statistics.interquartile_means(scores, reps=50), statistics.improvements(scores, reps=50)
-    assert (statistics.interquartile_means(scores, reps=50), statistics.improvements(scores, reps=50)) == first
+    first = measures.interquartile_means(scores, reps=50), measures.improvements(scores, reps=50)
+    assert (measures.interquartile_means(scores, reps=50), measures.improvements(scores, reps=50)) == first
     assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
     for value, low, high in (*first[0].values(), *first[1].values()):
         assert low < value < high
@@ -154,8 +181,16 @@ def test_intervals_are_seeded_and_leave_the_global_generator_alone():
 
 def test_improvement_counts_the_pairs_that_are_better():
     scores = {"decespg": np.array([[1.0], [3.0]]), "pg": np.array([[0.0], [2.0]]), "spg": np.array([[1.0], [1.0]])}
-    better = statistics.improvements(scores, reps=50)
+    better = measures.improvements(scores, reps=50)
     assert {method: value for method, (value, _, _) in better.items()} == {"pg": 0.75, "spg": 0.75}
+
+
+def test_a_profile_is_the_share_of_all_runs_above():
+    scores = {"pg": np.array([[0.0, 0.5], [0.2, 1.0]])}
+    value, low, high = measures.profiles(scores, np.array([0.1, 0.4, 0.9]), reps=50)["pg"]
+    assert value.tolist() == [0.75, 0.5, 0.25]
+    assert np.all(low <= value)
+    assert np.all(value <= high)
 
 
 def test_the_pace_of_what_nobody_has_timed_is_guessed_from_pg():

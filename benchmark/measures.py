@@ -8,6 +8,7 @@ from rliable import library, metrics
 
 import envs
 from benchmark.cells import METHODS
+from benchmark.results import BLOCK
 
 
 @cache
@@ -32,6 +33,25 @@ def difference(some, others, resamples=10_000):
     differences = some.last - others.last
     draws = np.random.default_rng(0).integers(0, len(differences), (resamples, len(differences)))
     return differences.mean(), *np.quantile(differences[draws].mean(1), (0.025, 0.975))
+
+
+def reached(result, good, share=0.95):
+    """When `share` of the trials were good: (episodes, environment steps of a trial, mean) up to the end of that block.
+
+    good: whether a trial was, in each block of episodes, [num_trials, blocks]. None if that never was so.
+    """
+    blocks = np.flatnonzero(good.mean(0) >= share)
+    return ((int(blocks[0]) + 1) * BLOCK, float(result.steps[:, blocks[0]].mean())) if len(blocks) else None
+
+
+def near_optimum(result, world, margin=0.05):
+    """Whether each trial's reward per step was within `margin` of the exact optimum, block by block."""
+    return result.score >= (1 - margin) * optimum(world)
+
+
+def at_best_outcome(result):
+    """Whether each trial ended most episodes of a block in the best outcome."""
+    return result.at_best > 0.5
 
 
 def scores_over_worlds(results, optimizer, worlds):
@@ -70,3 +90,10 @@ def improvements(scores, over="decespg", reps=1000):
             pairs, lambda x, y: np.array([metrics.probability_of_improvement(x, y)]), reps=reps
         )
     return {method: (means[method][0], *bounds[method][:, 0]) for method in pairs}
+
+
+def profiles(scores, shares, reps=500):
+    """{method: (share of all runs with at least each score, low, high)}, [len(shares)] each (Agarwal et al., 2021)."""
+    with seeded():
+        means, bounds = library.create_performance_profile(scores, shares, reps=reps)
+    return {method: (means[method], *bounds[method]) for method in scores}
