@@ -50,13 +50,13 @@ WORLDS = {
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=10.0),
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("findtreasure", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
+    ("findtreasure", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=10.0),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
     ("gotogether", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
     ("movebox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=10.0),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("pushbox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=30.0),
+    ("pushbox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=10.0),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=30.0),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0)  # what a world of your own gets
