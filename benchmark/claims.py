@@ -298,6 +298,23 @@ def claims_text(found):
     return "\n\n".join(part.strip() for part in parts)
 
 
+@dataclass(frozen=True)
+class Sentence:
+    """A sentence of this repository's texts, with names in braces where its figures stand."""
+
+    path: str
+    words: str
+    figures: Callable  # results -> {name: figure}
+    holds: Callable = lambda figures: True  # whether what is said besides the figures is true of them
+
+    def with_figures(self, found):
+        """The sentence as it has to stand there."""
+        return self.words.format(**self.figures(found))
+
+
+SENTENCES = ()
+
+
 def main(publish: bool = False):
     """Print what is claimed, what was measured and the verdict.
 

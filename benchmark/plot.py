@@ -1,0 +1,176 @@
+"""Your own runs in one figure and one table: any scripts, worlds, settings and seeds.
+
+    python benchmark/plot.py runs/pushbox/pg/* runs/pushbox/mine/* --output figure.png
+
+Runs that differ in nothing but their seeds are one curve: the mean over their trials and a 95 % bootstrap interval. Prints the
+reward per step over the last 5 % of the episodes and, in each world, what every curve has more than the first: the difference
+(of trials of the same seeds, if both have the same) and the probability that a trial of it ends better than one of the first.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import matplotlib
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import envs
+from benchmark.cells import settings_of
+from benchmark.report import markdown
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+POINTS = 100  # of the longest curve in a panel
+RESAMPLES = 2000  # of the bootstrap
+
+
+@dataclass(frozen=True)
+class Group:
+    """The trials of runs that differ in their seeds only."""
+
+    label: str
+    world: str
+    seeds: tuple[int, ...]
+    score: np.ndarray  # [num_trials, num_episodes] reward per step
+
+    @property
+    def last(self):
+        """Reward per step over the last 5 % of the episodes, [num_trials]."""
+        return self.score[:, -max(1, self.score.shape[1] // 20) :].mean(1)
+
+
+def read(directories):
+    """{settings without seeds, as text: {seed: reward per step [num_episodes]}} of finished runs; the others are named."""
+    found = {}
+    for directory in directories:
+        try:
+            settings = settings_of(directory)
+            with np.load(directory / "episodes.npz") as episodes:
+                scores = envs.reward_per_step(episodes["returns"], episodes["lengths"])
+        except Exception as error:  # whatever can be wrong with somebody's directory
+            why = "is not a finished run" if isinstance(error, OSError) else f"cannot be read ({type(error).__name__})"
+            print(f"{directory} {why} and is left out.", file=sys.stderr)
+            continue
+        first = settings.pop("seed")
+        settings.pop("num_trials")
+        trials = found.setdefault(json.dumps(settings), {})
+        trials.update({first + k: score for k, score in enumerate(scores)})
+    return found
+
+
+def groups_of(found):
+    """Name the curves after their method and whatever else distinguishes them."""
+    settings = [json.loads(text) for text in found]
+    groups = []
+    for own, trials in zip(settings, found.values(), strict=True):
+        others = [other for other in settings if (other["method"], other["env"]) == (own["method"], own["env"])]
+        names = [name for name in own if any(other.get(name) != own[name] for other in others)]
+        words = [
+            f"{name}={' '.join(map(str, value)) if isinstance(value, list) else value}"
+            for name in names
+            for value in [own[name]]
+        ]
+        seeds = tuple(sorted(trials))
+        score = np.stack([trials[seed] for seed in seeds])
+        groups.append(Group(" ".join([own["method"], *words]), Path(own["env"]).stem, seeds, score))
+    return groups
+
+
+def bootstrap(values, generator, statistic=lambda resampled: resampled.mean(1)):
+    """The 95 % interval of a statistic of trials [num_trials, ..]: (low, high)."""
+    draws = generator.integers(len(values), size=(RESAMPLES, len(values)))
+    return np.quantile(statistic(values[draws]), (0.025, 0.975), axis=0)
+
+
+def compare(one, other):
+    """What `one` has more than `other`: (difference, low, high), (probability that a trial of `one` ends better, low, high)."""
+    generator = np.random.default_rng(0)
+    if one.seeds == other.seeds:
+        paired = one.last - other.last
+        difference = paired.mean(), *bootstrap(paired, generator)
+    else:
+        draws = [
+            values.last[generator.integers(len(values.last), size=(RESAMPLES, len(values.last)))] for values in (one, other)
+        ]
+        difference = one.last.mean() - other.last.mean(), *np.quantile(draws[0].mean(1) - draws[1].mean(1), (0.025, 0.975))
+
+    def better(some, others):
+        return ((some[..., :, None] > others[..., None, :]) + 0.5 * (some[..., :, None] == others[..., None, :])).mean((-1, -2))
+
+    draws = [values.last[generator.integers(len(values.last), size=(RESAMPLES, len(values.last)))] for values in (one, other)]
+    return difference, (better(one.last, other.last), *np.quantile(better(*draws), (0.025, 0.975)))
+
+
+def draw(groups, path):
+    """A panel for each world."""
+    worlds = list(dict.fromkeys(group.world for group in groups))
+    figure, axes = plt.subplots(1, len(worlds), figsize=(4.6 * len(worlds) + 2, 3.6), layout="constrained", squeeze=False)
+    labels = list(dict.fromkeys(group.label for group in groups))
+    for axis, world in zip(axes[0], worlds, strict=True):
+        there = [group for group in groups if group.world == world]
+        block = max(1, max(group.score.shape[1] for group in there) // POINTS)
+        for group in there:
+            blocks = group.score[:, : group.score.shape[1] // block * block].reshape(len(group.score), -1, block).mean(2)
+            episodes = (np.arange(blocks.shape[1]) + 1) * block
+            (curve,) = axis.plot(episodes, blocks.mean(0), color=f"C{labels.index(group.label) % 10}", label=group.label)
+            axis.fill_between(
+                episodes, *bootstrap(blocks, np.random.default_rng(0)), color=curve.get_color(), alpha=0.2, linewidth=0
+            )
+        axis.set_title(world, fontsize="medium")
+        axis.set_xlabel("episode")
+    axes[0, 0].set_ylabel("reward per step")
+    curves = {label: curve for axis in axes[0] for curve, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(curves.values(), curves, loc="outside lower center", frameon=False)
+    with envs.complete_file(path) as file:
+        figure.savefig(file, dpi=130, format=path.suffix[1:] or "png")
+    plt.close(figure)
+
+
+def tables(groups):
+    """The scores of all, and in each world the differences to the first."""
+    scores, differences = [["world", "curve", "trials", "episodes", "reward per step", "95 % interval", "worst trial"]], []
+    for group in groups:
+        low, high = bootstrap(group.last, np.random.default_rng(0))
+        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", f"[{low:.2f}, {high:.2f}]"]
+        scores.append([group.world, group.label, *words, f"{group.last.min():.2f}"])
+    firsts = {group.world: group for group in reversed(groups)}
+    for group in (group for group in groups if group is not firsts[group.world]):
+        (difference, *bounds), (better, *shares) = compare(group, firsts[group.world])
+        words = ["{:+.2f} [{:+.2f}, {:+.2f}]".format(difference, *bounds), "{:.2f} [{:.2f}, {:.2f}]".format(better, *shares)]
+        differences.append([group.world, f"{group.label} - {firsts[group.world].label}", *words])
+    return scores, [["world", "curves", "difference", "probability of improvement"], *differences]
+
+
+def main(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], output: Path = Path("plot.png")):
+    """Read, draw, print.
+
+    Args:
+        runs: directories of finished runs
+        output: the picture (.png, .svg or .pdf)
+    """
+    if output.suffix not in (".png", ".svg", ".pdf"):
+        print(f"plot.py: --output must end in .png, .svg or .pdf, not {output}.", file=sys.stderr)
+        sys.exit(2)
+    groups = groups_of(read(runs))
+    if not groups:
+        print("plot.py: there is no finished run among these.", file=sys.stderr)
+        sys.exit(2)
+    for world in dict.fromkeys(group.world for group in groups):
+        episodes = sorted({group.score.shape[1] for group in groups if group.world == world})
+        if len(episodes) > 1:
+            print(
+                f"In {world} the curves have {' and '.join(map(str, episodes))} episodes: their ends cannot be compared.",
+                file=sys.stderr,
+            )
+    draw(groups, output)
+    scores, differences = tables(groups)
+    print(markdown(scores), *([markdown(differences)] if len(differences) > 1 else []), f"See {output}.", sep="\n\n")
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,105 @@
+"""benchmark/claims.py: the verdicts, and that README and docs/ quote the kept results."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from benchmark import claims, results
+from benchmark.report import DOCS
+from tests.test_results import some_result
+
+
+@pytest.fixture(scope="module")
+def kept():
+    return results.kept()
+
+
+def test_the_page_is_that_of_the_kept_results(kept):
+    assert claims.claims_text(kept) in (DOCS / "claims.md").read_text()
+
+
+@pytest.mark.parametrize("sentence", claims.SENTENCES, ids=lambda sentence: sentence.words[:40])
+def test_every_sentence_with_figures_stands_where_it_is_said_and_holds(sentence, kept):
+    text = " ".join((claims.ROOT / sentence.path).read_text().split())
+    figures = sentence.figures(kept)
+    assert sentence.with_figures(kept) in text
+    assert sentence.holds(figures), figures
+
+
+def end(mean, best=20, world="pushbox"):
+    """A result of 20 trials, `best` of them at the best outcome (4 of pushbox)."""
+    usual = np.array([4] * best + [1] * (20 - best))
+    return some_result(mean + np.linspace(-0.1, 0.1, 20), usual=usual, score=np.full((20, 2), mean))
+
+
+def pushbox(optimizer="sign", **ends):
+    return {("pushbox", method, optimizer): end(*value) for method, value in ends.items()}
+
+
+def judged(quote, found, optimizer="sign"):
+    (claim,) = [claim for claim in claims.CLAIMS if claim.quote.startswith(quote)]
+    return {(world, o): verdict for world, o, _, verdict in claims.judge(claim, found)}["pushbox", optimizer]
+
+
+def test_a_difference_is_judged_by_its_interval():
+    cells = claims.Cells(pushbox(decespg=(31.0,), spg=(30.0,), espg=(31.0,)), "pushbox", "sign")
+    assert cells.minus("decespg", "spg") == ("DecESPG - SPG = +1.00 [+1.00, +1.00]", "yes")
+    assert cells.minus("spg", "decespg")[1] == "no"
+    noisy = dataclasses.replace(cells["espg"], last=cells["espg"].last[::-1].copy())
+    assert (
+        claims.Cells({**cells.found, ("pushbox", "espg", "sign"): noisy}, "pushbox", "sign").minus("decespg", "espg")[1]
+        == "partly"
+    )
+
+
+def test_claims_about_where_trials_end():
+    baselines = dict.fromkeys(("pg", "ac", "coma", "acer", "edti"), (3.0, 0))
+    quote = "in PushBox, all baselines"
+    assert judged(quote, pushbox(**baselines)) == "yes"
+    assert judged(quote, pushbox(**{**baselines, "coma": (33.0, 18)})) == "partly"
+    assert judged(quote, pushbox(**{**baselines, "coma": (4.0, 1)})) == "yes"
+    assert judged(quote, pushbox("adam", **baselines), "adam") == "open"  # DQN is missing
+    assert judged(quote, pushbox("adam", **baselines, dqn=(2.0, 0)), "adam") == "yes"
+    quote, memory = "selective memory is essential", dict.fromkeys(("spg", "espg", "decespg"), (31.0, 19))
+    assert judged(quote, pushbox(pg=(3.0, 0), epg=(4.0, 9), **memory)) == "yes"
+    assert judged(quote, pushbox(pg=(3.0, 10), epg=(4.0, 11), **memory)) == "partly"
+    assert judged("GASIL, which converges", pushbox(gasil=(20.0, 14))) == "partly"
+
+
+def test_the_best_of_the_others_is_who_counts():
+    found = pushbox(decespg=(31.0,), pg=(3.0,), ac=(4.0,), coma=(33.0,), acer=(3.0,), edti=(2.0,))
+    assert judged("DecESPG reached the best performance in", found) == "no"
+    found.update(pushbox(coma=(30.0,)))
+    assert judged("DecESPG reached the best performance in", found) == "yes"
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "word"),
+    [
+        ("yes yes yes yes", "reproduced"),
+        ("no no no no", "not reproduced"),
+        ("open open open open", "open"),
+        ("yes no yes no", "only under sign"),
+        ("no yes partly yes", "only under adam"),
+        ("yes no yes yes", "partly"),
+        ("partly partly partly partly", "partly"),
+        ("yes open yes open", "reproduced (2 of 4 cases open)"),
+        ("yes yes open open", "reproduced (2 of 4 cases open)"),
+    ],
+)
+def test_the_verdict_on_a_whole_claim(verdicts, word):
+    cases = [("a", "sign"), ("a", "adam"), ("b", "sign"), ("b", "adam")]
+    rows = [(*case, "", verdict) for case, verdict in zip(cases, verdicts.split(), strict=True)]
+    assert claims.overall(rows) == word
+
+
+def test_worse_with_training_is_a_matter_of_standard_errors():
+    noise = np.random.default_rng(0).normal(scale=0.01, size=20)
+    found = {("cleaner", method, "sign"): some_result(0.05 + noise, score=np.full((20, 3), 0.11)) for method in ("pg", "coma")}
+    words, verdict = claims.worse_with_training(claims.Cells(found, "cleaner", "sign"))
+    assert verdict == "yes"
+    assert re.match(r"PG 0.11 in the first 100 episodes, 0.0\d in the end; COMA 0.11 ", words)
+    found["cleaner", "coma", "sign"] = some_result(0.2 + noise, score=np.full((20, 3), 0.11))
+    assert claims.worse_with_training(claims.Cells(found, "cleaner", "sign"))[1] == "partly"

@@ -1,0 +1,77 @@
+"""benchmark/plot.py: one's own runs in one figure and one table."""
+
+import numpy as np
+import pytest
+
+import envs
+from algos import pg
+from benchmark import plot
+from benchmark.plot import Group
+from tests.helpers import train
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """PG's seeds 1 to 5 in two runs, and three of them with another learning rate and fewer episodes."""
+    folder = tmp_path_factory.mktemp("runs")
+    short = dict(env="pushbox", max_steps=5)
+    logs = [
+        train(pg, folder / "a", **short, seed=1, num_trials=2, num_episodes=60).log,
+        train(pg, folder / "b", **short, seed=3, num_trials=3, num_episodes=60).log,
+        train(pg, folder / "c", **short, seed=1, num_trials=3, num_episodes=40, learning_rate=0.01).log,
+    ]
+    return folder, logs
+
+
+def score(log):
+    return envs.reward_per_step(log.returns, log.lengths)
+
+
+def test_runs_that_differ_in_their_seeds_are_one_curve(runs):
+    folder, (first, second, other) = runs
+    one, two = plot.groups_of(plot.read([folder / "b", folder / "a", folder / "c"]))
+    assert one.seeds == (1, 2, 3, 4, 5)
+    assert np.array_equal(one.score, np.concatenate([score(first), score(second)]))
+    assert np.array_equal(two.score, score(other))
+    assert [group.label for group in (one, two)] == [
+        "pg num_episodes=60 learning_rate=0.0003",
+        "pg num_episodes=40 learning_rate=0.01",
+    ]
+    assert one.last == pytest.approx(one.score[:, -3:].mean(1))
+
+
+def test_differences_are_those_of_the_same_seeds_where_there_are_the_same():
+    noise = np.random.default_rng(0).normal(scale=100, size=(20, 1))
+    one, other = (Group("", "pushbox", tuple(range(20)), noise + shift) for shift in (2.0, 0.0))
+    (difference, low, high), (better, *_) = plot.compare(one, other)
+    assert (difference, low, high) == pytest.approx((2, 2, 2))
+    assert 0.5 < better < 0.6
+    fewer = Group("", "pushbox", tuple(range(1, 20)), noise[1:])
+    (_, low, high), _ = plot.compare(one, fewer)
+    assert low < -20 < 20 < high
+    assert plot.compare(Group("", "", (1,), np.array([[3.0]])), Group("", "", (2,), np.array([[3.0]])))[1] == (0.5, 0.5, 0.5)
+
+
+@pytest.mark.parametrize("name", ["figure.png", "figure.svg"])
+def test_the_figure_and_both_tables(name, runs, tmp_path, capsys):
+    folder, _ = runs
+    plot.main((folder / "a", folder / "b", folder / "c", tmp_path / "none"), output=tmp_path / name)
+    said, warned = capsys.readouterr()
+    assert (tmp_path / name).stat().st_size > 5000
+    assert "| pushbox | pg num_episodes=60 learning_rate=0.0003 | 5 | 60 | " in said
+    assert "| pushbox | pg num_episodes=40 learning_rate=0.01 - pg num_episodes=60 learning_rate=0.0003 | " in said
+    assert warned == (
+        f"{tmp_path}/none is not a finished run and is left out.\n"
+        "In pushbox the curves have 40 and 60 episodes: their ends cannot be compared.\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("output", "said"), [("a.png", "there is no finished run among these."), ("a", "--output must end in")]
+)
+def test_what_cannot_be_drawn(output, said, tmp_path, capsys):
+    with pytest.raises(SystemExit) as error:
+        plot.main((tmp_path,), output=tmp_path / output)
+    assert error.value.code == 2
+    assert f"plot.py: {said}" in capsys.readouterr().err
+    assert not (tmp_path / output).exists()
