@@ -116,8 +116,10 @@ def leaderboard(found):
         if any(points):
             place = worlds.index(world), *(point[1] if point else np.inf for point in reversed(points))
             words = [word for point in points for word in ([str(point[0]), f"{point[1]:,.0f}"] if point else ["-", "-"])]
-            rows.append((place, [Path(world).stem, name_of(method), optimizer, *words]))
-    head = ["world", "method", "optimiser", "best outcome: episodes", "steps", "within 5 % of the optimum: episodes", "steps"]
+            at_end = [str(good[:, -1].sum()) for good in goods]
+            rows.append((place, [Path(world).stem, name_of(method), optimizer, *words[:2], at_end[0], *words[2:], at_end[1]]))
+    head = ["world", "method", "optimiser", "best outcome: episodes", "steps", "trials in the end"]
+    head += ["within 5 % of the optimum: episodes", "steps", "trials in the end"]
     return [head, *(row for _, row in sorted(rows))]
 
 
