@@ -162,11 +162,13 @@ def versions(found):
     return ", ".join(f"{name} {' and '.join(numbers)}" for name, numbers in seen.items())
 
 
-def whole_comparison_hours(found, cores=2):
-    """Hours that all cells take at Table 1's episodes on some cores, by the kept times."""
+def time_needed(found, cores=2):
+    """How long all cells take at Table 1's episodes, by the kept times; only of worlds in which there are some."""
     pace = results.seconds_per_episode(found)
-    cells = select(METHODS, WORLDS, OPTIMIZERS)
-    return sum(pace[cell.method, cell.world] * cell.settings["num_episodes"] for cell in cells) / 3600 / cores
+    worlds = [world for world in WORLDS if any(w == world and result.seconds > 0 for (w, *_), result in found.items())]
+    cells = select(METHODS, worlds, OPTIMIZERS)
+    hours = sum(pace[cell.method, cell.world] * cell.settings["num_episodes"] for cell in cells) / 3600 / cores
+    return f"All cells of {', '.join(worlds)} at Table 1's episodes take about {hours:.1f} hours on {cores} cores."
 
 
 def all_figures(found):
@@ -264,10 +266,8 @@ MORE = {
 def page(found, drawn):
     """report.html."""
     parts = ["<h1>Cooperative multi-agent exploration: the comparison</h1>"]
-    cells, hours = select(METHODS, WORLDS, OPTIMIZERS), whole_comparison_hours(found)
-    there = f"{len(found)} of {len(cells)} cells are there"
-    parts.append(f"<p>{datetime.now():%Y-%m-%d}: {there}, made with {versions(found)}. ")
-    parts.append(f"All of them at Table 1's episodes take about {hours:.0f} hours on two cores.</p>")
+    there = f"{len(found)} of {len(select(METHODS, WORLDS, OPTIMIZERS))} cells are there"
+    parts.append(f"<p>{datetime.now():%Y-%m-%d}: {there}, made with {versions(found)}. {time_needed(found)}</p>")
     parts += ["<h2>Reward per step, last 5 % of the episodes</h2>", html_table(score_table(found))]
     parts += ["<h2>DecESPG minus SPG: what the bonus adds to the memory</h2>", html_table(difference_table(found))]
     parts += ["<h2>Sample efficiency: until 95 % of the trials are there</h2>", html_table(leaderboard(found))]
@@ -330,7 +330,7 @@ def main(args: Args):
         publish(found, drawn)
     plt.close("all")
     print(markdown(score_table(found)), markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")
-    print(f"\nAll cells at Table 1's episodes: about {whole_comparison_hours(found):.1f} hours on two cores. See {output_dir}.")
+    print(f"\n{time_needed(found)} See {output_dir}.")
 
 
 if __name__ == "__main__":
