@@ -10,7 +10,18 @@
 of your own will do: `python -m envs my_world.py` plays it in a terminal, as `python -m envs pushbox` does.
 """
 
-from envs.base import PositionWorld, UsageError, World, check_choice, check_number, check_whole, kernel, rule
+from envs.base import (
+    PositionWorld,
+    UsageError,
+    World,
+    check_choice,
+    check_memory,
+    check_number,
+    check_whole,
+    kernel,
+    plain,
+    rule,
+)
 from envs.drawing import draw, save_gif
 from envs.files import complete_file
 from envs.parallel import GridParallelEnv

@@ -6,7 +6,6 @@
 After every step it prints the map, what each agent observes and what the team earned.
 """
 
-import sys
 import time
 from dataclasses import dataclass
 
@@ -14,6 +13,7 @@ import numpy as np
 import tyro
 
 import envs
+from envs.command import command_line
 
 
 @dataclass
@@ -34,7 +34,7 @@ def play(args: Args):
     """Play one episode and print all of it, until its end or that of the keyboard's input."""
     env = envs.make(args.world, render_mode="ansi", **envs.parse_options(args.options))
     rng = np.random.default_rng(envs.check_whole("--seed", args.seed, minimum=0))
-    delay = envs.check_number("--delay", args.delay, lowest=0)
+    delay = envs.check_number("--delay", args.delay, lowest=0, highest=3600)
     letters = {name.split()[-1][0]: action for action, name in enumerate(env.world.action_names)}
     obs, _ = env.reset()
     print(describe(env, obs))
@@ -85,13 +85,8 @@ def ask(env, letters):
 
 
 def main():
-    try:
+    with command_line("python -m envs"):
         play(tyro.cli(Args, prog="python -m envs", description=__doc__))
-    except envs.UsageError as error:
-        print(f"python -m envs: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ function `observe` that says what each agent sees of it. Everything else (vector
 """
 
 import atexit
+import os
 import shutil
 import sys
 import tempfile
@@ -82,7 +83,9 @@ class World:
         state_scale: factors that bring the entries of the state into about [0, 1], [state_dim]
         max_steps:   an episode is cut (truncated) after this many steps
         """
-        self.max_steps = check_whole("max_steps", max_steps, minimum=1)
+        self.max_steps = check_whole("max_steps", max_steps, minimum=1, maximum=LONGEST)
+        if max(len(self.action_names), len(self.outcome_names)) > MOST_NAMES:
+            raise UsageError(f"{self.name} must have at most {MOST_NAMES} actions and as many outcomes.")
         self.rules, self.start = rules, np.array(start, np.int64)
         self.local_index = np.array(local_index, np.int64)
         self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, float(cell)
@@ -110,27 +113,56 @@ class World:
         raise UsageError(f"{self.name} cannot be drawn, because its class has no method `sketch`.")
 
 
-def check_whole(option, value, minimum):
-    """`value` if it is a whole number of at least `minimum`; UsageError otherwise."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
-        raise UsageError(f"{option} must be a whole number of at least {minimum}, not {value!r}.")
-    return int(value)
+LARGEST = 2**63 - 1  # whole numbers beyond 64 bits are none of numpy's
+LONGEST = 2**31 - 1  # steps of an episode, whose lengths are kept in 32 bits
+MOST_NAMES = 127  # actions and outcomes are kept in 8 bits
+LARGEST_MAP = 1001  # cells a side, of worlds whose size is free
+
+
+def plain(value):
+    """Python's own value in the place of one of numpy's."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def check_whole(option, value, minimum, maximum=LARGEST):
+    """`value` as an int if it is a whole number between `minimum` and `maximum`; UsageError otherwise."""
+    value = plain(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= maximum:
+        raise UsageError(f"{option} must be a whole number {limits(minimum, maximum, value)}, not {value!r}.")
+    return value
 
 
 def check_number(option, value, lowest, highest=np.inf):
     """`value` as a float if it is a finite number between `lowest` and `highest`; UsageError otherwise."""
-    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    if not (number and np.isfinite(value) and lowest <= value <= highest):
-        bounds = f"of at least {lowest}" if highest == np.inf else f"between {lowest} and {highest}"
-        raise UsageError(f"{option} must be a number {bounds}, not {value!r}.")
+    value = plain(value)
+    largest = LARGEST if isinstance(value, int) else np.inf
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not (number and max(lowest, -largest) <= value <= min(highest, largest) and np.isfinite(value)):
+        said = f"between {lowest} and {highest}" if highest < np.inf else limits(lowest, largest, value)
+        raise UsageError(f"{option} must be a number {said}, not {value!r}.")
     return float(value)
+
+
+def limits(lowest, highest, value):
+    """What numbers are accepted where `value` is not; a highest one that is only technical is named to whom it concerns."""
+    beyond = isinstance(value, int) and value > highest
+    return f"between {lowest} and {highest}" if beyond else f"of at least {lowest}"
 
 
 def check_choice(option, value, choices):
     """`value` if it is one of `choices`; UsageError otherwise."""
-    if value not in choices or type(value) is not type(choices[0]):
+    value = plain(value)
+    if type(value) is not type(choices[0]) or value not in choices:
         raise UsageError(f"{option} must be one of {', '.join(map(repr, choices))}, not {value!r}.")
     return value
+
+
+def check_memory(what, num_bytes):
+    """UsageError if `what` would need more memory than this machine has: said before it is tried, which may take long."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    if num_bytes > there:
+        needed, has = (f"{number // 10**9:,} GB" for number in (num_bytes, there))
+        raise UsageError(f"{what} would need {needed} of memory, and this machine has {has}.")
 
 
 @rule

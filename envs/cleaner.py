@@ -22,21 +22,22 @@ Rewards       +1 for every cell that an agent stands on after its move for the f
 Outcomes      none: an episode goes on until the time limit, clean or not.
 Optimum       71 = all cells (0.357 per step): there are too many states for a search, but the plan that `plan`
               constructs cleans them all, played by these rules, in far less than 200 steps.
-Options       size (13; odd, at least 5), num_agents (2), observation, maze_seed (None: the published maze for size 13,
-              seed 0 for another size; a number: a maze drawn from this seed), max_steps (200).
+Options       size (13; odd, 5 to 1001), num_agents (2; 1 to 1000), observation, maze_seed (None: the published maze for
+              size 13, seed 0 for another size; a number: a maze drawn from this seed), max_steps (200).
 Source        the published env_Cleaner, whose maze is drawn at random; the one above is one of its mazes. Rewards also
               in Section 4.1. That code's agents see the dirt, those of Section 4.1 the agents' positions.
 """
 
 import numpy as np
 
-from envs.base import PositionWorld, UsageError, check_whole, rule
+from envs.base import LARGEST_MAP, PositionWorld, UsageError, check_whole, rule
 
 MAZE = (
     *("#############", "#...#.......#", "#.#.###.###.#", "#.#.#...#...#", "###.###.#.###", "#.......#...#", "#.#.#.#######"),
     *("#.#.#.#.#...#", "#.#####.#.###", "#...........#", "###.###.###.#", "#...#.....#.#", "#############"),
 )
 WALL = -1
+MOST_AGENTS = 1000
 UP, DOWN, LEFT, RIGHT = range(4)
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))  # rows and columns that these lead on
 
@@ -78,16 +79,16 @@ class Cleaner(PositionWorld):
         maze_seed: int | None = None,
         max_steps: int = 200,
     ):
-        check_whole("size", size, minimum=5)
+        size = check_whole("size", size, minimum=5, maximum=LARGEST_MAP)
         if size % 2 == 0:
             raise UsageError(f"cleaner's size must be odd (the maze's rooms lie at odd rows and columns), not {size}.")
-        check_whole("num_agents", num_agents, minimum=1)
+        num_agents = check_whole("num_agents", num_agents, minimum=1, maximum=MOST_AGENTS)
         if maze_seed is None and size == len(MAZE):
             free = np.array([[cell == "." for cell in row] for row in MAZE])
         else:
             free = random_maze(size, 0 if maze_seed is None else check_whole("maze_seed", maze_seed, minimum=0))
         num_cells = int(free.sum())
-        places = np.full((size, size), WALL, np.int16)
+        places = np.full((size, size), WALL, np.int32)  # room for the largest map's half a million cells
         places[free] = 2 * num_agents + np.arange(num_cells)
         super().__init__(places, [1, 1] * num_agents + [1] * num_cells, size, num_agents, observation, max_steps)
 
@@ -96,16 +97,18 @@ class Cleaner(PositionWorld):
 
         In a maze without loops this is a walk in depth, in which the agents part wherever the way does.
         """
-        state, plan = self.start.copy(), []
-        for _ in range(self.max_steps):
+        state, plan = self.start.copy(), np.full((self.max_steps, self.num_agents), UP)
+        for t in range(self.max_steps):
+            if not state[2 * self.num_agents :].any():
+                break  # all is clean
             taken, joint = set(), []
             for i in range(self.num_agents):
                 action, cell = self.nearest_dirt(state, tuple(state[2 * i : 2 * i + 2]), taken)
                 taken.add(cell)
                 joint.append(action)
-            plan.append(joint)
-            self.step(self.rules, state, np.array(joint))
-        return np.array(plan)
+            plan[t] = joint
+            self.step(self.rules, state, plan[t])
+        return plan
 
     def nearest_dirt(self, state, start, taken):
         """The first action on the way from the cell `start` to the nearest dirty cell that is not in `taken`, and this cell.

@@ -14,7 +14,7 @@ class Curves:
 
     def __init__(self, directories, text, purge=None):
         """text: shown beside the curves; purge [num_trials]: TensorBoard forgets what it had after this many steps."""
-        name = f"events.out.tfevents.{time.time():.0f}.{socket.gethostname()}.{os.getpid()}"
+        name = f"events.out.tfevents.{time.time():.6f}.{socket.gethostname()}.{os.getpid()}"
         self.paths, self.waiting = [directory / name for directory in directories], [[] for _ in directories]
         for k, directory in enumerate(directories):
             directory.mkdir(parents=True, exist_ok=True)
@@ -22,7 +22,7 @@ class Curves:
             if purge is None:
                 value = summary_pb2.Summary.Value(tag="arguments", metadata=create_summary_metadata("", None))
                 value.tensor.dtype = types_pb2.DT_STRING
-                value.tensor.string_val.append(text.encode())
+                value.tensor.string_val.append(text.encode(errors="backslashreplace"))
                 self._append(k, 0, summary=summary_pb2.Summary(value=[value]))
             else:
                 log = event_pb2.SessionLog(status=event_pb2.SessionLog.START)

@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from envs.base import check_whole
+from envs.base import check_memory, check_whole
 from envs.files import complete_file
 
 PAPER, GRID, INK = "#ffffff", "#d4d4d4", "#222222"
@@ -53,6 +53,7 @@ def draw(world, state, cell=48, caption=""):
     cell = check_whole("cell", cell, minimum=6)
     rows, columns, shapes = world.sketch(state)
     width, height = columns * cell, rows * cell
+    check_memory(f"a picture of {rows} rows and {columns} columns", 3 * width * height * FINE**2)
     large = Image.new("RGB", (width * FINE, height * FINE), PAPER)
     pen, unit = ImageDraw.Draw(large), cell * FINE
     line = max(1, round(cell / 48)) * FINE  # whole pixels of the finished picture: sharp

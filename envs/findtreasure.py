@@ -17,14 +17,14 @@ Rewards       treasure reached by any agent +100; both agents on the meeting cel
               wall, the closed door or the teammate -0.1 for each bump.
 Outcomes      1 treasure, 2 meeting (the local optimum; the paper's "alternative terminal state"). Both end the episode.
 Optimum       treasure in 8 steps, return 100 (14.29 per step); meeting in 4 steps, return 3 (1.00 per step).
-Options       size (7; odd, at least 7: the same map drawn larger), observation, max_steps (200).
+Options       size (7; odd, 7 to 1001: the same map drawn larger), observation, max_steps (200).
 Source        the map, the rules and the bump's cost are the authors' published env_FindTreasure; rewards also in
               Section 4.1.
 """
 
 import numpy as np
 
-from envs.base import PositionWorld, UsageError, check_whole, rule
+from envs.base import LARGEST_MAP, PositionWorld, UsageError, check_whole, rule
 
 UP, DOWN, LEFT, RIGHT, WAIT = range(5)
 FREE, WALL, DOOR, LEVER, MEETING, TREASURE = range(6)
@@ -68,7 +68,7 @@ class FindTreasure(PositionWorld):
     step = staticmethod(step)
 
     def __init__(self, size: int = 7, observation: str = "positions", max_steps: int = 200):
-        check_whole("size", size, minimum=7)
+        size = check_whole("size", size, minimum=7, maximum=LARGEST_MAP)
         if size % 2 == 0:
             raise UsageError(f"findtreasure's size must be odd (the wall has a middle cell), not {size}.")
         middle, last = size // 2, size - 2

@@ -1,6 +1,5 @@
 """A picture of all worlds side by side, in the style of the paper's Figure 2: `python -m envs.gallery docs/worlds.png`."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 import envs
+from envs.command import command_line
 from envs.drawing import INK, PAPER
 
 SIDE, GAP, TEXT = 420, 40, 30  # pixels: a map's side (at most), the space between two maps, the names' letters
@@ -38,14 +38,14 @@ def gallery():
 
 
 def main():
-    args = tyro.cli(Args, prog="python -m envs.gallery", description=__doc__)
-    try:
-        args.path.parent.mkdir(parents=True, exist_ok=True)
-        with envs.complete_file(args.path) as file:
-            Image.fromarray(gallery()).save(file, "PNG", optimize=True)
-    except OSError as error:
-        print(f"python -m envs.gallery: cannot write {args.path}: {error.strerror}.", file=sys.stderr)
-        sys.exit(2)
+    with command_line("python -m envs.gallery"):
+        args = tyro.cli(Args, prog="python -m envs.gallery", description=__doc__)
+        try:
+            args.path.parent.mkdir(parents=True, exist_ok=True)
+            with envs.complete_file(args.path) as file:
+                Image.fromarray(gallery()).save(file, "PNG", optimize=True)
+        except OSError as error:
+            raise envs.UsageError(f"cannot write {args.path}: {error.strerror}.") from error
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ Rewards       both agents at the goal +10; after every step, the last one too, -
               distance 0 or 1) or too far apart (squared distance above 9).
 Outcomes      1 goal: both agents at the goal, which ends the episode. They are too close there, so it pays 9.5.
 Optimum       goal in 23 steps, return 9.5 (0.43 per step).
-Options       size (15; at least 5: agents start at (size - 3, 1) and (size - 2, 2), the goal is (1, size - 2)),
+Options       size (15; 5 to 1001: agents start at (size - 3, 1) and (size - 2, 2), the goal is (1, size - 2)),
               observation, max_steps (2000).
 Source        the map and the rules are the authors' published env_GoTogether; rewards also in Section 4.1, the time
               limit in Table 1.
@@ -23,7 +23,7 @@ Source        the map and the rules are the authors' published env_GoTogether; r
 
 import numpy as np
 
-from envs.base import PositionWorld, check_whole, rule
+from envs.base import LARGEST_MAP, PositionWorld, check_whole, rule
 
 FREE, WALL, GOAL = range(3)
 UP, DOWN, LEFT, RIGHT = range(4)
@@ -58,7 +58,7 @@ class GoTogether(PositionWorld):
     step = staticmethod(step)
 
     def __init__(self, size: int = 15, observation: str = "positions", max_steps: int = 2000):
-        check_whole("size", size, minimum=5)
+        size = check_whole("size", size, minimum=5, maximum=LARGEST_MAP)
         grid = np.full((size, size), WALL, np.int8)
         grid[1:-1, 1:-1] = FREE
         grid[1, size - 2] = GOAL

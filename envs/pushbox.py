@@ -144,7 +144,7 @@ class PushBox(World):
         step_penalty: float = 0.0,
         max_steps: int = 200,
     ):
-        self.size = check_choice("pushbox's size", size, (4, 6, 8, 10))
+        self.size = size = check_choice("pushbox's size", size, (4, 6, 8, 10))
         margin, y = {4: (0, 0), 6: (0, 1)}.get(size, (1, 1))  # columns between wall and agent; the agents' row
         left, right, large = margin, size - 1 - margin, size // 2 - 1
         penalties = (

@@ -11,7 +11,7 @@ rollout keeps these distinct observations and, for each step, which of them it w
 import numpy as np
 from numba import float64, typeof
 
-from envs.base import World, by_address, kernel
+from envs.base import World, by_address, check_memory, kernel
 from envs.vector import GridVectorEnv
 
 
@@ -193,6 +193,8 @@ class Rollout:
         """
         self.world, self.head, self.greedy = world, head, greedy
         agents, steps, dim = world.num_agents, world.max_steps, world.obs_dim
+        numbers = len(world.start) + agents * (dim + 4)  # of a step, in all the arrays below
+        check_memory(f"{num_trials} x {steps} steps of an episode", 8 * num_trials * steps * numbers)
         shape = (steps, num_trials, agents)
         self.lengths, self.outcomes = np.zeros((2, num_trials), np.int64)
         self.entropy, self.finite = np.zeros(num_trials), True

@@ -15,6 +15,7 @@ It is the only file of envs/ that imports torch.
 
 import contextlib
 import fcntl
+import hashlib
 import inspect
 import json
 import os
@@ -25,6 +26,7 @@ import threading
 import time
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated, get_type_hints
@@ -35,6 +37,7 @@ import tyro
 from tqdm import tqdm
 
 import envs
+from envs.command import command_line, one_line, silence
 from envs.curves import Curves
 
 # torch's optimisers ask its compiler to leave them alone, for which they import it: 2.6 of 5.6 seconds of start-up, for nothing
@@ -112,6 +115,7 @@ def resolve(args, worlds, tuned, other):
     worlds: {world: {argument: value}}, what Table 1 fixes. tuned: {(world, optimizer): {argument: value}}, what the tuning rule
     has chosen. other: {argument: value} of worlds that these tables do not know.
     """
+    args = type(args)(**{name: envs.plain(value) for name, value in vars(args).items()})
     optimizer = getattr(args, "optimizer", "adam")  # Q-learning has no policies, and Adam always
     known = {**worlds.get(args.env, {}), **tuned.get((args.env, optimizer), {})}
     defaults = {"num_episodes": 10_000, **other, **known, "run_dir": default_run_dir(args)}
@@ -120,6 +124,7 @@ def resolve(args, worlds, tuned, other):
     world = envs.make_world(args.env, **{**limit, **envs.parse_options(args.env_args)})
     resolved = type(args)(**{**values, "max_steps": world.max_steps})
     check_limits(resolved)
+    check_room(resolved, world)
     torch.set_num_threads(1)  # a process is one core; ./benchmark.sh starts one for each
     return resolved, world
 
@@ -134,6 +139,17 @@ def check_limits(args, names=None):
                     envs.check_number(option(name), number, limit.lowest, limit.highest)
 
 
+def check_room(args, world):
+    """UsageError if what a run holds from its beginning to its end would not fit into this machine's memory."""
+    trials, networks = args.num_trials, args.num_trials * world.num_agents
+    log, others = 13 * args.num_episodes, 10_000  # bytes of a trial: its episodes, and its generators and whatever else
+    envs.check_memory(f"a log of {trials} x {args.num_episodes} episodes", trials * (log + others))
+    widths = (world.obs_dim, *getattr(args, "hidden", ()), world.num_actions)
+    weights = sum(width * next_width for width, next_width in pairwise(widths))
+    what = f"{networks} networks with hidden layers of {' and '.join(map(str, widths[1:-1]))}"
+    envs.check_memory(what, 16 * networks * weights)  # a weight, its gradient and Adam's two moments
+
+
 def default_run_dir(args):
     """runs/<env>/<method>/seed<first>[-<last>][-<arguments that are not the default>]"""
     words = [f"seed{args.seed}" + f"-{args.seed + args.num_trials - 1}" * (args.num_trials > 1)]
@@ -141,7 +157,10 @@ def default_run_dir(args):
         value = getattr(args, field.name)
         if value != field.default and field.name not in ("env", "seed", "num_trials", *HOUSEKEEPING):
             words.append(f"{field.name}={','.join(map(str, value)) if isinstance(value, tuple) else value}")
-    return Path("runs", Path(args.env).stem, script_of(args).stem, "-".join(words).replace("/", "_"))
+    name = "-".join(words).replace("/", "_")
+    if len(os.fsencode(name)) > 200:  # no file system takes names of more than 255 bytes
+        name = f"{os.fsdecode(os.fsencode(name)[:180])}-{hashlib.sha256(os.fsencode(name)).hexdigest()[:8]}"
+    return Path("runs", Path(args.env).stem, script_of(args).stem, name)
 
 
 def generators_of(args):
@@ -377,17 +396,12 @@ def commit_of(directory):
     return ""
 
 
-def one_line(error):
-    """What an exception says, in one line without a full stop."""
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
-
-
 def say(line):
     """Print a line at once; UsageError if nobody can take it, such as a full disk."""
     try:
         print(line, flush=True)
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python would try again at its end, and complain
+        silence(sys.stdout)
         raise envs.UsageError(f"cannot write to standard output: {error.strerror}.") from error
 
 
@@ -422,7 +436,7 @@ def load(path, script):
     The team is what the script's `build` makes, with everything that had been learnt. UsageError if it cannot be loaded.
     """
     path, method = Path(path), Path(script.__file__).stem
-    if not path.exists():
+    if not os.path.exists(path):  # unlike path.exists(), of a name that is too long as well
         raise envs.UsageError(f"there is no file {path}.")
     try:
         saved = torch.load(path, weights_only=True)
@@ -470,9 +484,6 @@ def option(name):
 def main(args_class, build, train):
     """The command line of a script: train, or with --evaluate play. Ends with code 2 and one sentence for bad input."""
     script = sys.modules[args_class.__module__]
-    try:
+    with command_line(Path(script.__file__).name):
         args = tyro.cli(args_class, description=script.__doc__)
         evaluate(args, script) if args.evaluate else train(args)
-    except envs.UsageError as error:
-        print(f"{Path(script.__file__).name}: {error}", file=sys.stderr)
-        sys.exit(2)

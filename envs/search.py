@@ -4,6 +4,7 @@ Nothing here knows a world's numbers; what is found is what `world.step` says. T
 return with which it can be reached in exactly t steps; the steps that end the episode give the best by outcome and length.
 """
 
+import sys
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -11,11 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from tqdm import tqdm
 
-from envs.base import UsageError, World
+from envs.base import UsageError, World, check_memory
 from envs.statistics import reward_per_step
 
 MAX_STATES = 3_000_000
+AT_ONCE = 10**8  # states times actions times steps between two looks of the bar and of Ctrl-C: under a second
+PATIENCE = 2  # seconds without a bar
 ROUNDING = 1e-9  # returns that differ by less are the same sum, added up in another order
 
 
@@ -53,11 +57,15 @@ class Optimum:
 
 
 def find_optimum(world: World) -> Optimum:
-    """The optimum of `world` within its max_steps; UsageError if it has more than MAX_STATES states.
+    """The optimum of `world` within its max_steps; UsageError if it has more than MAX_STATES states or needs too much memory.
 
-    Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions. A world that says that it is not
-    searchable gives the episode of its own `plan` instead.
+    Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions. Where a long time limit takes more
+    than some seconds, a bar on stderr says how far it is. A world that says that it is not searchable gives the episode of its
+    own `plan` instead.
     """
+    table = 8 * (world.max_steps + 1) * max(len(world.outcome_names) + 1, world.num_agents)
+    check_memory(f"a table of {world.max_steps} steps", 3 * table)
+    check_memory(f"all joint actions of {world.num_agents} agents", 100 * world.num_actions**world.num_agents)
     if not world.searchable:
         return played_plan(world)
     joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
@@ -83,7 +91,7 @@ def find_optimum(world: World) -> Optimum:
 def played_plan(world: World) -> Optimum:
     """The episode of `world.plan()`, played by the world's rules; it lasts until the time limit."""
     state, plan = world.start.copy(), world.plan()
-    total = sum(world.step(world.rules, state, actions)[0] for actions in plan)
+    total = sum(world.step(world.rules, state, actions)[0] for actions in progress(plan, unit="step"))
     episode = Episode("time limit", len(plan), total, float(reward_per_step(total, len(plan))))
     return Optimum({}, episode, episode, None)
 
@@ -113,7 +121,7 @@ def compile_explore(step):
         The start is state 0. More than `limit` states: it gives up, and S > limit.
         """
         room = limit + len(joint)  # the system hands out only the memory that is written to
-        states = np.empty((room, len(start)), np.int16)
+        states = np.empty((room, len(start)), np.int64)
         following = np.empty((room, len(joint)), np.int32)
         reward = np.empty((room, len(joint)))
         table = np.full(1 << 23, -1, np.int32)  # at most 3 / 8 full
@@ -140,7 +148,11 @@ def compile_explore(step):
     return explore
 
 
-@njit(cache=True)
+def progress(steps=None, **options):
+    """A bar on stderr that appears after some seconds and goes when all is done."""
+    return tqdm(steps, desc="optimum", delay=PATIENCE, leave=False, disable=sys.stderr is None, **options)
+
+
 def best_returns(following, reward, num_outcomes, max_steps):
     """The largest return of an episode by its length t and outcome k, [max_steps + 1, num_outcomes + 1]; -inf if there is none.
 
@@ -149,7 +161,22 @@ def best_returns(following, reward, num_outcomes, max_steps):
     returns = np.full((max_steps + 1, num_outcomes + 1), -np.inf)
     value = np.full(len(following), -np.inf)  # largest return with which a state is reached in exactly t steps
     value[0] = 0.0
-    for t in range(1, max_steps + 1):
+    at_once = 1 + AT_ONCE // following.size
+    with progress(total=max_steps, unit="step") as bar:
+        settled = False
+        for first in range(1, max_steps + 1, at_once):
+            last = min(first + at_once - 1, max_steps)
+            settled = settled or _further_steps(following, reward, value, returns, first, last)
+            bar.update(last - first + 1)
+    returns[max_steps, 0] = value.max()
+    return returns
+
+
+@njit(cache=True)
+def _further_steps(following, reward, value, returns, first, last):
+    """The steps from `first` to `last` of `best_returns`; True if it now knows all that would follow, and has written it."""
+    max_steps = len(returns) - 1
+    for t in range(first, last + 1):
         later = np.full(len(following), -np.inf)
         for s in range(len(following)):
             if value[s] == -np.inf:
@@ -162,12 +189,11 @@ def best_returns(following, reward, num_outcomes, max_steps):
                     returns[t, -target] = max(returns[t, -target], total)
         gain = later[0] - value[0]
         predicted = value + gain
-        value = later
+        value[:] = later
         if np.isfinite(gain) and np.all((later == predicted) | (np.abs(later - predicted) < 1e-9)):
             # This step added the same gain to every state's value, so every later step will: the rest is known.
             for rest in range(t + 1, max_steps + 1):
                 returns[rest] = returns[rest - 1] + gain
-            value = value + gain * (max_steps - t)
-            break
-    returns[max_steps, 0] = value.max()
-    return returns
+            value += gain * (max_steps - t)
+            return True
+    return False

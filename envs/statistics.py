@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from envs.base import World
+from envs.base import World, check_memory
 
 
 def reward_per_step(returns, lengths):
@@ -14,6 +14,8 @@ class EpisodeLog:
     """Undiscounted team returns, lengths and outcomes of all episodes of all trials, each [num_trials, num_episodes]."""
 
     def __init__(self, world: World, num_trials: int, num_episodes: int):
+        """UsageError if so many do not fit into the memory of this machine."""
+        check_memory(f"a log of {num_trials} x {num_episodes} episodes", 13 * num_trials * num_episodes)
         self.world = world
         self.returns = np.zeros((num_trials, num_episodes))
         self.lengths = np.zeros((num_trials, num_episodes), np.int32)

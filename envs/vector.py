@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.base import World, check_whole, compile_batch
+from envs.base import World, check_memory, check_whole, compile_batch
 from envs.drawing import draw
 
 
@@ -30,7 +30,9 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
 
     def __init__(self, world: World, num_envs: int = 1):
         self.world = world
-        self.num_envs = check_whole("num_envs", num_envs, minimum=1)
+        self.num_envs = num_envs = check_whole("num_envs", num_envs, minimum=1)
+        numbers = 3 * len(world.start) + world.local_index.size + world.num_agents * (world.obs_dim + 4)  # of a copy
+        check_memory(f"{num_envs} copies of {world.name}", 8 * num_envs * numbers)
         self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": ["rgb_array"]}
         self.render_mode = "rgb_array"
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (world.num_agents, world.obs_dim), np.float32)

@@ -3,6 +3,7 @@
 import ast
 import importlib.util
 import inspect
+import os
 import sys
 from pathlib import Path
 
@@ -21,6 +22,8 @@ def make_world(name: str, **options) -> World:
 
     UsageError for an unknown world or option, an impossible value, or a file that holds no world.
     """
+    if not isinstance(name, str | Path):
+        raise UsageError(f"a world is named by a word such as 'pushbox' or by its file, not by {name!r}.")
     name = str(name)
     if name in WORLDS:
         world = WORLDS[name]
@@ -38,7 +41,7 @@ def make_world(name: str, **options) -> World:
 
 def world_in_file(path):
     """The one subclass of World that a Python file defines."""
-    if not path.is_file():
+    if not os.path.isfile(path):  # unlike path.is_file(), of a name that is too long as well
         raise UsageError(f"there is no file {path}.")
     name = f"world_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -69,6 +72,6 @@ def parse_options(words) -> dict:
             raise UsageError(f"a world's option is written option=value, not {word!r}.")
         try:
             options[option] = ast.literal_eval(value)
-        except (ValueError, SyntaxError):
+        except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):  # all that Python may say of such a text
             options[option] = value
     return options

@@ -108,6 +108,22 @@ def test_a_drawn_maze_joins_all_rooms_without_a_loop(half, seed):
     assert is_tree(world)
 
 
+@pytest.mark.parametrize("size", [127, 255, 257, 301])
+def test_the_rules_hold_in_mazes_of_any_size(size):
+    """The last room's number in the state is beyond 16 bits from size 257 on."""
+    world = envs.make_world("cleaner", size=size)
+    free = world.rules != WALL
+    assert np.array_equal(world.rules[free], 4 + np.arange(free.sum()))
+    last = size - 2
+    _, _, reward, _ = play(world, [last, last, 1, 1], (DOWN, UP))
+    assert reward == 2
+
+
+def test_sizes_are_numbers_of_any_type():
+    world = envs.make_world("cleaner", size=np.int8(13), num_agents=np.int8(100))
+    assert len(world.start) == 200 + 71
+
+
 def test_mazes_come_from_their_seed():
     def maze(**options):
         return (envs.make_world("cleaner", **options).rules != WALL).tolist()
@@ -169,6 +185,10 @@ def test_nobody_in_a_wall_and_the_reward_is_the_dirt_that_is_gone(actions):
     ("accepted", "options"),
     [
         ("at least 5", {"size": 3}),
+        ("between 5 and 1001", {"size": 1003}),
+        ("between 1 and 1000", {"num_agents": 10**9}),
+        ("between 0 and 9223372036854775807", {"maze_seed": 10**30}),
+        ("between 1 and 2147483647", {"max_steps": 10**30}),
         ("odd", {"size": 8}),
         ("at least 1", {"num_agents": 0}),
         ("at least 1", {"num_agents": 2.0}),

@@ -569,6 +569,18 @@ BAD_INPUT = {
     "--seed -1": "--seed must be a number of at least 0, not -1",
     "--log-every 0": "--log-every must be a number of at least 1, not 0",
     "--checkpoint-every -1": "--checkpoint-every must be a number of at least 0, not -1",
+    "--checkpoint-every nan": "--checkpoint-every must be a number of at least 0, not nan",
+    # beyond 64 bits
+    "--seed 100000000000000000000": "--seed must be a number between 0 and 9223372036854775807, not 100000000000000000000",
+    "--hidden 64 100000000000000000000": "--hidden must be a number between 1 and 9223372036854775807",
+    "--max-steps 1000000000000000000000": "max_steps must be a whole number between 1 and 2147483647",
+    "--env-args lone_push_penalty=100000000000000000000": "lone_push_penalty must be a number between 0 and 922337203685477",
+    "--env cleaner --env-args maze_seed=100000000000000000000": "maze_seed must be a whole number between 0 and",
+    # beyond the memory of this machine, whether that is said before it is tried or after
+    "--num-episodes 1000000000000": "a log of 1 x 1000000000000 episodes would need 13,000 GB of memory, and this machine has",
+    "--num-trials 1000000000000": "a log of 1000000000000 x 20000 episodes would need",
+    "--max-steps 2000000000": "1 x 2000000000 steps of an episode would need",
+    "--hidden 10000000000": "2 networks with hidden layers of 10000000000 would need",
     "--resume": "there is nothing to resume",
     "--run-dir file": "cannot write to file",
     "--run-dir file/below": "cannot write to file/below",
@@ -595,6 +607,35 @@ def test_bad_input_is_refused_in_one_sentence(words, said, files):
     before = contents(files)
     assert_refusal("pg", command("pg", *words.split()), said)
     assert contents(files) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("decespg", "--window 10000000000"),
+        ("decespg", "--window 9223372036854775807"),
+        ("spg", "--slots 10000000000"),
+        ("espg_icm", "--features 9000000000000000000"),
+    ],
+)
+def test_what_does_not_fit_into_memory_is_refused(name, words, files):
+    before = contents(files)
+    assert_refusal(name, command(name, *words.split(), "--num-episodes", 2), "this is too large for the machine (")
+    assert contents(files) == before
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    args = dict(num_episodes=np.int64(2), num_trials=np.int8(1), seed=np.uint8(3), gamma=np.float32(0.5), max_steps=np.int16(3))
+    train(pg, tmp_path, **args)
+    about = json.loads((tmp_path / "args.json").read_text())["args"]
+    assert [about[name] for name in args] == [2, 1, 3, 0.5, 3]
+
+
+def test_a_default_directory_has_no_longer_name_than_a_file_system_takes():
+    args = [pg.Args(env_args=("x" * 300, last)) for last in "ab"]
+    names = [run.default_run_dir(each).name for each in args]
+    assert names[0] != names[1]
+    assert all(len(os.fsencode(name)) <= 200 and name.startswith("seed1-env_args=xxx") for name in names)
 
 
 def test_an_empty_directory_name_is_refused(files):

@@ -111,6 +111,18 @@ def test_worlds_with_too_many_states_are_refused(monkeypatch):
     assert_refused("at most 327 states", envs.optimum, "findtreasure")
 
 
+def test_a_time_limit_beyond_memory_is_refused():
+    for name in ("findtreasure", "cleaner"):
+        assert_refused("a table of 2000000000 steps would need", envs.optimum, name, max_steps=2_000_000_000)
+
+
+def test_a_long_search_says_how_far_it_is(monkeypatch, capsys):
+    monkeypatch.setattr("envs.search.AT_ONCE", 1)
+    monkeypatch.setattr("envs.search.PATIENCE", 0)
+    assert envs.optimum("findtreasure", max_steps=50).best_return.steps == 8
+    assert "/50 [" in capsys.readouterr().err
+
+
 def test_the_table():
     lines = str(envs.optimum("findtreasure")).splitlines()
     assert [line.split() for line in lines] == [

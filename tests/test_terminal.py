@@ -77,7 +77,8 @@ def test_positions_are_told_in_cells(monkeypatch, capsys):
         ("cleaner, findtreasure, gotogether, movebox, pushbox", ["treasure"]),
         ("4, 6, 8, 10", ["pushbox", "size=5"]),
         ("option=value", ["pushbox", "size"]),
-        ("at least 0", ["pushbox", "--delay", "-1"]),
+        ("between 0 and 3600", ["pushbox", "--delay", "-1"]),
+        ("between 0 and 3600", ["pushbox", "--delay", "1e300"]),
         ("at least 0", ["pushbox", "--seed", "-1"]),
     ],
 )
