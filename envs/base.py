@@ -157,6 +157,11 @@ def check_choice(option, value, choices):
     return value
 
 
+def check_seed(seed):
+    """`seed` as an int or None, as `reset` takes it; UsageError otherwise."""
+    return None if seed is None else check_whole("seed", seed, minimum=0)
+
+
 def check_memory(what, num_bytes):
     """UsageError if `what` would need more memory than this machine has: said before it is tried, which may take long."""
     there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

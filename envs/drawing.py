@@ -13,7 +13,7 @@ from collections import Counter
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from envs.base import check_memory, check_whole
+from envs.base import check_memory, check_number, check_whole
 from envs.files import complete_file
 
 PAPER, GRID, INK = "#ffffff", "#d4d4d4", "#222222"
@@ -128,8 +128,17 @@ def _draw_agent(pen, colour, x, y, radius, facing):
 def save_gif(path, frames, fps=4):
     """Write the film of `frames` (pictures of one size, as `draw` makes them) to `path`; it loops and rests on its last frame.
 
-    The file appears at once and complete, or not at all.
+    fps: frames per second, 0.01 to 50, which is what a GIF can say. The file appears at once and complete, or not at all.
+    ValueError if there are no frames, or not all are pictures [height, width, 3] (uint8) of one size.
     """
+    frames, fps = [np.asarray(frame) for frame in frames], check_number("fps", fps, lowest=0.01, highest=50)
+    if not frames:
+        raise ValueError("a film needs at least one frame.")
+    for frame in frames:
+        picture = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3 and frame.size
+        if not picture or frame.shape != frames[0].shape:
+            what = f"{frame.dtype} {frame.shape}"
+            raise ValueError(f"frames must be pictures [height, width, 3] (uint8) of one size, not {what}.")
     images = [Image.fromarray(frame) for frame in frames]
     colours = Counter()
     for image in images:

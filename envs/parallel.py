@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 from pettingzoo import ParallelEnv
 
-from envs.base import World, check_choice
+from envs.base import World, check_choice, check_seed
 from envs.drawing import draw, text_map
 
 RENDER_MODES = ("rgb_array", "ansi", "human")
@@ -47,7 +47,11 @@ class GridParallelEnv(ParallelEnv):
         return self.action_spaces[agent]
 
     def reset(self, seed=None, options=None):
-        """Start a new episode; the worlds are deterministic, whatever `seed` and `options`."""
+        """Start a new episode; the worlds are deterministic, whatever `seed` and `options` (PettingZoo's test gives some).
+
+        UsageError for a seed that is not a whole number of at least 0.
+        """
+        check_seed(seed)
         self.agents = list(self.possible_agents)
         self._state, self._clock = self.world.start.copy(), 0
         if self.render_mode == "human":
@@ -65,7 +69,7 @@ class GridParallelEnv(ParallelEnv):
         if set(actions) != set(agents):
             raise ValueError(f"actions must be of {', '.join(agents)}, not of {', '.join(map(str, actions)) or 'nobody'}.")
         for agent, action in actions.items():
-            if action not in self.action_spaces[agent]:
+            if isinstance(action, bool) or action not in self.action_spaces[agent]:
                 raise ValueError(f"{agent}'s action must be a whole number from 0 to {world.num_actions - 1}, not {action!r}.")
         joint = np.array([int(actions[agent]) for agent in agents])
         reward, outcome = world.step(world.rules, self._state, joint)

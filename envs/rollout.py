@@ -11,7 +11,7 @@ rollout keeps these distinct observations and, for each step, which of them it w
 import numpy as np
 from numba import float64, typeof
 
-from envs.base import World, by_address, check_memory, kernel
+from envs.base import World, by_address, check_memory, check_whole, kernel
 from envs.vector import GridVectorEnv
 
 
@@ -193,6 +193,7 @@ class Rollout:
         """
         self.world, self.head, self.greedy = world, head, greedy
         agents, steps, dim = world.num_agents, world.max_steps, world.obs_dim
+        num_trials = check_whole("num_trials", num_trials, minimum=1)
         numbers = len(world.start) + agents * (dim + 4)  # of a step, in all the arrays below
         check_memory(f"{num_trials} x {steps} steps of an episode", 8 * num_trials * steps * numbers)
         shape = (steps, num_trials, agents)
@@ -211,7 +212,7 @@ class Rollout:
             np.zeros(num_trials * agents, np.int64),  # how many distinct observations each network has met
         )
         self._tables = np.empty((agents, buckets), np.int64)
-        self._compiled = None
+        self._compiled = self._kinds = None
         self._nets = np.arange(num_trials * agents).reshape(num_trials, agents)
 
     def play(self, params, generators, parameter=1.0):
@@ -223,8 +224,10 @@ class Rollout:
         for generator, row in zip(generators, self._uniforms, strict=True):
             generator.random(out=row)
         arrays = tuple(param if isinstance(param, np.ndarray) else param.detach().numpy() for param in params)
-        if self._compiled is None:
+        kinds = [(array.dtype, array.shape, array.flags.c_contiguous, array.flags.writeable) for array in arrays]
+        if kinds != self._kinds:  # what is compiled asks no more
             self._compile(arrays)
+            self._kinds = kinds
         most = self._compiled(*self._rules, arrays, float(parameter), self.greedy, *self._arrays)
         self.finite = most > 0
         self._show(self._obs[:, : abs(most)])
@@ -232,6 +235,7 @@ class Rollout:
     def _compile(self, params):
         """Make ready `_play`, to be called without numba asking in every episode of what types the arguments are (0.2 ms)."""
         world, real = self.world, params[0].dtype
+        self._check(params)
         hidden, outputs = np.empty((2, max(max(p.shape[1:]) for p in params)), real), np.empty(world.num_actions, real)
         head = by_address(self.head, typeof(outputs), float64[::1], float64)
         self._rules = *world.compiled, head, world.rules, world.cell, world.start, world.max_steps
@@ -243,6 +247,18 @@ class Rollout:
         types = tuple(typeof(argument) for argument in (*self._rules, params, 1.0, self.greedy, *self._arrays))
         _play.compile(types)
         self._compiled = _play.overloads[types].entry_point
+
+    def _check(self, params):
+        """ValueError if these are not the weights and biases of networks for this world."""
+        shapes, nets, width = [param.shape for param in params], self._nets.size, self.world.obs_dim
+        for weights, bias in zip(shapes[::2], shapes[1::2], strict=True):
+            if len(weights) != 3 or weights[:2] != (nets, width) or bias != (nets, 1, weights[2]):
+                raise ValueError(
+                    f"a layer of the shapes {weights} and {bias} does not fit to {nets} networks of {width} numbers."
+                )
+            width = weights[2]
+        if width != self.world.num_actions or len({param.dtype for param in params}) != 1 or params[0].dtype.kind != "f":
+            raise ValueError(f"params must end in {self.world.num_actions} outputs and be floats of one type.")
 
     def play_with(self, policy, generators):
         """Play with any policy: policy(obs) says the probabilities of all actions, [num_trials, num_agents, num_actions].

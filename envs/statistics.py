@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from envs.base import World, check_memory
+from envs.base import World, check_memory, check_whole
 
 
 def reward_per_step(returns, lengths):
@@ -15,6 +15,8 @@ class EpisodeLog:
 
     def __init__(self, world: World, num_trials: int, num_episodes: int):
         """UsageError if so many do not fit into the memory of this machine."""
+        num_trials = check_whole("num_trials", num_trials, minimum=1)
+        num_episodes = check_whole("num_episodes", num_episodes, minimum=1)
         check_memory(f"a log of {num_trials} x {num_episodes} episodes", 13 * num_trials * num_episodes)
         self.world = world
         self.returns = np.zeros((num_trials, num_episodes))

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from envs.base import World, check_memory, check_whole, compile_batch
+from envs.base import World, check_memory, check_seed, check_whole, compile_batch
 from envs.drawing import draw
 
 
@@ -45,29 +45,42 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         fixed = (world.rules, world.cell, world.local_index, world.state_scale, self._memory)
         self._look = partial(look, *fixed)
         self._advance = partial(advance, *fixed, world.num_actions, world.max_steps)
-        self._actions_shape = (num_envs, world.num_agents)
+        self._actions = np.zeros((num_envs, world.num_agents), np.int64)
+        self._was_reset = False
         self._spare = iter(())
 
     def reset(self, *, seed=None, options=None):
-        """Start new episodes in the copies of options["reset_mask"] or in all; worlds are deterministic, whatever `seed`."""
-        super().reset(seed=seed)
-        mask = np.asarray(options["reset_mask"]) if options and "reset_mask" in options else np.ones(self.num_envs, bool)
+        """Start new episodes in the copies of options["reset_mask"] or in all; worlds are deterministic, whatever `seed`.
+
+        ValueError for another option, a mask of another shape or type, or a seed that is not a whole number of at least 0.
+        """
+        super().reset(seed=check_seed(seed))
+        options = {} if options is None else dict(options)
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if options:
+            raise ValueError(f"reset has no option {next(iter(options))!r}; it takes reset_mask.")
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(f"reset_mask must be booleans of shape {(self.num_envs,)}.")
         self._memory[mask] = self._initial
+        self._was_reset = True
         *_, outcome, obs, state, local_state = next(self._spare, None) or self._make_spare()
         outcome[:] = self._memory[:, 0]
         self._look(obs, state, local_state)
         return obs, {"outcome": outcome, "state": state, "local_state": local_state}
 
     def step(self, actions):
-        """One joint action (whole numbers [num_envs, num_agents]) in every copy; see the class for what comes back."""
+        """One joint action (whole numbers [num_envs, num_agents]) in every copy; see the class for what comes back.
+
+        ValueError for actions of another shape, type or value, and before the first reset.
+        """
         actions = np.asarray(actions)
-        if actions.shape != self._actions_shape or actions.dtype.kind not in "iu":
-            raise ValueError(f"actions must be whole numbers of shape {self._actions_shape}.")
-        actions = np.ascontiguousarray(actions, np.int64)  # the rules are compiled for one type of whole numbers
+        if actions.shape != self._actions.shape or actions.dtype.kind not in "iu":
+            raise ValueError(f"actions must be whole numbers of shape {self._actions.shape}.")
+        if not self._was_reset:
+            raise ValueError("no episode is under way; reset() starts one.")
+        self._actions[...] = actions  # the rules are compiled for one type, byte order and layout
         reward, terminated, truncated, outcome, obs, state, local_state = next(self._spare, None) or self._make_spare()
-        if not self._advance(actions, reward, terminated, truncated, outcome, obs, state, local_state):
+        if not self._advance(self._actions, reward, terminated, truncated, outcome, obs, state, local_state):
             raise ValueError(f"actions must be between 0 and {self.world.num_actions - 1}.")
         return obs, reward, terminated, truncated, {"outcome": outcome, "state": state, "local_state": local_state}
 

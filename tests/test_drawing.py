@@ -1,5 +1,7 @@
 """Pictures and films: what is where in which colour, that agents in one cell are all seen, that files appear whole."""
 
+import re
+
 import numpy as np
 import pytest
 from PIL import Image, ImageColor
@@ -130,6 +132,23 @@ def test_a_film(tmp_path):
             durations.append(gif.info["duration"])
             assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - frame).max() <= 16
     assert durations == [200, 200, 200, 2000]
+
+
+@pytest.mark.parametrize(
+    ("said", "frames", "fps"),
+    [
+        ("at least one frame", [], 4),
+        ("of one size, not uint8 (4, 5, 3)", [np.zeros((5, 5, 3), np.uint8), np.zeros((4, 5, 3), np.uint8)], 4),
+        ("not float64 (5, 5, 3)", [np.zeros((5, 5, 3))], 4),
+        ("not uint8 (5, 5)", [np.zeros((5, 5), np.uint8)], 4),
+        ("fps must be a number between 0.01 and 50, not 0", [np.zeros((5, 5, 3), np.uint8)], 0),
+        ("fps must be a number between 0.01 and 50, not 1000", [np.zeros((5, 5, 3), np.uint8)], 1000),
+    ],
+)
+def test_what_is_no_film_is_refused(said, frames, fps, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        envs.save_gif(tmp_path / "walk.gif", frames, fps)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_film_that_fails_leaves_the_old_one(tmp_path, monkeypatch):

@@ -131,7 +131,7 @@ def test_a_copy_that_went_through_pickle_plays_on():
     assert np.array_equal(env.state(), copy.state())
 
 
-@pytest.mark.parametrize("action", [-1, 4, 1.0, "up", None])
+@pytest.mark.parametrize("action", [-1, 4, 1.0, "up", None, True, np.True_])
 def test_impossible_actions_are_refused(action):
     env = envs.make("cleaner")
     env.reset()

@@ -379,3 +379,40 @@ def test_the_options_of_a_world_of_ones_own():
     assert envs.make_world(str(RACE), size=3, max_steps=7).max_steps == 7
     assert_refused("it takes size, max_steps", envs.make_world, str(RACE), speed=3)
     assert_refused("at least 2", envs.make_world, str(RACE), size=1)
+
+
+def network(dtype=np.float32, inputs=5, outputs=4):
+    """Weights and biases of the networks of one pushbox team, without a hidden layer."""
+    return [np.zeros((2, inputs, outputs), dtype), np.zeros((2, 1, outputs), dtype)]
+
+
+@pytest.mark.parametrize(
+    "params",
+    [
+        network(inputs=4),
+        network(outputs=3),
+        network(int),
+        network()[:1],
+        [network()[0], network(np.float64)[1]],
+        [network()[0], network(outputs=2)[1]],
+        [array[0] for array in network()],
+    ],
+)
+def test_networks_that_do_not_fit_are_refused(params):
+    rollout = envs.Rollout(envs.make_world("pushbox", max_steps=3), num_trials=1)
+    generators = [np.random.default_rng(0)]
+    rollout.play(network(), generators)  # what is compiled for it would read beyond the others' ends
+    with pytest.raises(ValueError, match=r"fit|params|zip"):
+        rollout.play(params, generators)
+
+
+def test_networks_of_another_type_or_layout_play_the_same():
+    played = []
+    rollout = envs.Rollout(envs.make_world("pushbox", max_steps=9), num_trials=1)
+    rng = np.random.default_rng(1)
+    params = [rng.normal(size=array.shape).astype(np.float32) for array in network()]
+    for kind in (np.float32, np.float64, np.asfortranarray, np.ascontiguousarray):
+        changed = [param.astype(kind) if isinstance(kind, type) else kind(param) for param in params]
+        rollout.play(changed, [np.random.default_rng(0)])
+        played.append(rollout.actions.tolist())
+    assert played == [played[0]] * 4

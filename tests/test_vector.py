@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
+from envs.base import compile_batch
 from tests.helpers import BEST_PLANS, assert_refused, random_play, walk, whole_state
 
 each_world = pytest.mark.parametrize("name", envs.WORLDS)
@@ -139,7 +140,74 @@ def test_impossible_actions_are_refused(name, place):
             env.step(actions)
 
 
+def unaligned(actions):
+    """The same numbers at an odd address."""
+    return np.frombuffer(b"\0" + actions.astype(np.int64).tobytes(), np.uint8)[1:].view(np.int64).reshape(actions.shape)
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        lambda actions: actions.tolist(),
+        lambda actions: actions.astype(np.int8),
+        lambda actions: actions.astype(np.uint64),
+        lambda actions: actions.astype(">i8"),
+        np.asfortranarray,
+        lambda actions: np.repeat(actions, 2, axis=1)[:, ::2],
+        lambda actions: np.broadcast_to(actions, actions.shape),  # read-only
+        unaligned,
+    ],
+)
+def test_actions_of_any_type_and_layout_need_no_new_compilation(kind):
+    env, plain = (envs.make_vec("pushbox", num_envs=2) for _ in range(2))
+    _, advance = compile_batch(env.world.step, env.world.observe)
+    env.reset(), plain.reset()
+    for joint in BEST_PLANS["pushbox"]:
+        actions = np.array([joint, joint[::-1]])
+        expected = plain.step(actions)
+        compiled = len(advance.signatures)
+        assert np.array_equal(env.step(kind(actions))[1], expected[1])
+        assert len(advance.signatures) == compiled
+
+
+@pytest.mark.parametrize(
+    "wrong", [[[True, False]] * 2, np.zeros((2, 2)), [["0", "1"]] * 2, [[0, 0]], 0, None, [[0, 2**70]] * 2]
+)
+def test_what_is_no_joint_action_is_refused(wrong):
+    env = envs.make_vec("pushbox", num_envs=2)
+    env.reset()
+    with pytest.raises(ValueError, match="actions must be whole numbers of shape"):
+        env.step(wrong)
+    with pytest.raises(ValueError, match="between 0 and 3"):
+        env.step(np.full((2, 2), 2**64 - 1, np.uint64))
+
+
+def test_nothing_is_played_before_the_first_reset():
+    env = envs.make_vec("pushbox")
+    with pytest.raises(ValueError, match="no episode is under way"):
+        env.step([[0, 0]])
+
+
+@pytest.mark.parametrize("seed", ["a", True, 1.5, -1, [1, 2]])
+def test_a_seed_is_a_whole_number(seed):
+    for env in (envs.make_vec("pushbox"), envs.make("pushbox")):
+        assert_refused("seed must be a whole number of at least 0", env.reset, seed=seed)
+        env.reset(seed=np.int64(3))
+
+
+def test_an_unknown_option_of_reset_is_refused():
+    with pytest.raises(ValueError, match="reset has no option 'reset_masks'"):
+        envs.make_vec("pushbox").reset(options={"reset_masks": np.array([True])})
+    with pytest.raises(ValueError, match="reset_mask must be booleans"):
+        envs.make_vec("pushbox", num_envs=2).reset(options={"reset_mask": [1, 0]})
+
+
 def test_impossible_environments_are_refused():
+    assert_refused("such as 'pushbox'", envs.make_vec, ["pushbox"])
+    assert_refused("between 1 and 9223372036854775807", envs.make_vec, "pushbox", num_envs=10**30)
+    assert_refused("GB of memory, and this machine has", envs.make_vec, "pushbox", num_envs=10**9)
+    assert_refused("there is no file", envs.make_vec, "long" * 100 + ".py")
+    assert envs.make_vec("pushbox", num_envs=np.int8(2), size=np.int64(6)).num_envs == 2
     assert_refused("cleaner, findtreasure, gotogether, movebox, pushbox", envs.make_vec, "treasure")
     assert_refused("at least 1", envs.make_vec, "pushbox", num_envs=0)
     assert_refused("option=value", envs.parse_options, ["size"])
