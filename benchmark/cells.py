@@ -154,7 +154,7 @@ def seeds_of(text):
 
 def settings_of(run_dir):
     """The settings of a run that is there, in the form of `Cell.settings`."""
-    about = json.loads((run_dir / "args.json").read_text())
+    about = json.loads((run_dir / "args.json").read_text(encoding="utf-8"))
     return {"method": about["method"], **{k: v for k, v in about["args"].items() if k not in run.HOUSEKEEPING}}
 
 

@@ -78,7 +78,7 @@ def progress(cell):
 
 def last_line(cell):
     """The last line of a cell's output."""
-    lines = cell.log.read_text(errors="replace").replace("\r", "\n").split("\n") if cell.log.exists() else []
+    lines = cell.log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n").split("\n") if cell.log.exists() else []
     return next((line.strip() for line in reversed(lines) if line.strip()), "no output")
 
 

@@ -37,7 +37,7 @@ class Result:
 
         method: their script, unless it is one of algos/
         """
-        abouts = [json.loads((run_dir / "args.json").read_text()) for run_dir in run_dirs]
+        abouts = [json.loads((run_dir / "args.json").read_text(encoding="utf-8")) for run_dir in run_dirs]
         args = {name: value for name, value in abouts[0]["args"].items() if name not in run.HOUSEKEEPING}
         world = envs.make_world(args["env"])
         blocks_of_seeds = [np.load(run_dir / "episodes.npz") for run_dir in run_dirs]
@@ -53,7 +53,7 @@ class Result:
             return values[:, : blocks * BLOCK].reshape(trials, blocks, BLOCK)
 
         commits = sorted({about.get("commit", "") for about in abouts})
-        seconds = [float(text.read_text()) for run_dir in run_dirs if (text := run_dir / "seconds").exists()]
+        seconds = [float(text.read_text(encoding="utf-8")) for run_dir in run_dirs if (text := run_dir / "seconds").exists()]
         return cls(
             score=in_blocks(envs.reward_per_step(returns, lengths)).mean(2).astype(np.float32),
             at_best=in_blocks(outcomes == (world.best_outcome if world.outcome_names else -1)).mean(2).astype(np.float32),

@@ -128,7 +128,7 @@ class Table:
         self.method, self.path, self.rows = method, ROOT / "benchmark" / "tuning" / f"{method}.csv", {}
         self.lock = threading.Lock()
         if self.path.exists():
-            with self.path.open(newline="") as file:
+            with self.path.open(newline="", encoding="utf-8") as file:
                 _, *rows = csv.reader(file)
             self.rows = {tuple(row[:4]): tuple(map(float, row[4:7])) for row in rows}
 

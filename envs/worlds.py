@@ -4,6 +4,7 @@ import ast
 import importlib.util
 import inspect
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -43,7 +44,7 @@ def world_in_file(path):
     """The one subclass of World that a Python file defines."""
     if not os.path.isfile(path):  # unlike path.is_file(), of a name that is too long as well
         raise UsageError(f"there is no file {path}.")
-    name = f"world_{path.stem}"
+    name = "world_" + re.sub(r"\W", "_", path.stem)  # numba takes no letters that the locale cannot read
     spec = importlib.util.spec_from_file_location(name, path)
     module = sys.modules[name] = importlib.util.module_from_spec(spec)  # numba looks for a module of this name
     try:

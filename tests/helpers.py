@@ -34,7 +34,7 @@ each_setting = pytest.mark.parametrize(
     ("env", "optimizer"), list(itertools.product(("findtreasure", "pushbox"), ("sign", "adam")))
 )
 RACE = Path(__file__).parent / "data" / "race.py"  # a world of the user's own
-RECORDED = json.loads((Path(__file__).parent / "data" / "trajectories.json").read_text())
+RECORDED = json.loads((Path(__file__).parent / "data" / "trajectories.json").read_text(encoding="utf-8"))
 # The shortest way to the best outcome, a list of joint actions; of cleaner, which has no outcomes, its constructed plan.
 BEST_PLANS = {
     "cleaner": envs.make_world("cleaner").plan().tolist(),

@@ -40,7 +40,7 @@ def wait_for_episode(cell, episode, seconds=300):
     """Wait until a cell's progress bar has passed an episode."""
     deadline = time.monotonic() + seconds
     while compare.progress(cell) < episode:
-        assert time.monotonic() < deadline, cell.log.read_text() if cell.log.exists() else "nothing was started"
+        assert time.monotonic() < deadline, cell.log.read_text(encoding="utf-8") if cell.log.exists() else "nothing was started"
         time.sleep(0.02)
 
 
@@ -95,7 +95,7 @@ def test_killed_scripts_and_runners_lose_nothing(tmp_path):
     last = start(runs)
     said, _ = last.communicate(timeout=300)
     assert (last.returncode, "0 failed" in said, "0 not finished" in said) == (0, True, True), said
-    assert decespg.log.read_text().count("usual end") == 1
+    assert decespg.log.read_text(encoding="utf-8").count("usual end") == 1
     assert (pg.run_dir / "episodes.npz").stat().st_mtime_ns == finished_at
     for cell in (pg, decespg):
         for name, values in expected[cell.method].items():
@@ -162,7 +162,7 @@ def test_a_result_of_another_shape_is_broken(cell, wrong):
 
 def test_a_result_of_other_settings_is_broken(cell):
     finish(cell)
-    about = json.loads((cell.run_dir / "args.json").read_text())
+    about = json.loads((cell.run_dir / "args.json").read_text(encoding="utf-8"))
     about["args"]["gamma"] = 0.5
     (cell.run_dir / "args.json").write_text(json.dumps(about))
     assert not cell.finished
@@ -179,7 +179,7 @@ def test_other_settings_are_another_directory(cell, monkeypatch):
 
 
 def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, capsys):
-    text = (ROOT / "algos" / "pg.py").read_text()
+    text = (ROOT / "algos" / "pg.py").read_text(encoding="utf-8")
     (tmp_path / "mine.py").write_text(text.replace("str(Path(__file__).resolve().parents[1])", repr(str(ROOT))))
     world = ROOT / "tests" / "data" / "race.py"
     words = ["--algos", tmp_path / "mine.py", "--envs", world, "--optimizers", "sign"]

@@ -12,7 +12,9 @@ import envs
 
 ROOT = Path(envs.__file__).parents[1]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCKS = [block for text in TEXTS for block in re.findall(r"```(bash|python)\n(.*?)```", text.read_text(), re.DOTALL)]
+BLOCKS = [
+    block for text in TEXTS for block in re.findall(r"```(bash|python)\n(.*?)```", text.read_text(encoding="utf-8"), re.DOTALL)
+]
 COMMANDS = [line for kind, block in BLOCKS if kind == "bash" for line in block.splitlines()]
 
 
@@ -46,7 +48,7 @@ def folder(tmp_path_factory):
 def test_ci_runs_exactly_the_test_command():
     install_and_test = [command for command in COMMANDS if command.endswith("-m pytest -n 2")]
     assert len(install_and_test) == 1
-    assert install_and_test[0] in (ROOT / ".ci" / "run").read_text().splitlines()
+    assert install_and_test[0] in (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
 
 
 def test_the_first_command_installs_and_trains(folder):
@@ -68,7 +70,7 @@ def test_the_example_commands_run(folder):
 
 
 def test_the_shown_numbers_of_changed_lines_are_those_of_diff():
-    rows = re.findall(r"^\| (\w+) \| (\w+) \| (\d+) / (\d+) \|", (ROOT / "README.md").read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| (\w+) \| (\w+) \| (\d+) / (\d+) \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert len(rows) >= 8
     for one, other, gone, new in rows:
         words = ["diff", f"algos/{one}.py", f"algos/{other}.py"]
@@ -112,7 +114,11 @@ def test_the_example_of_a_world_works_wherever_a_name_does(folder):
 @pytest.mark.parametrize("policy", ["SharedPolicy(init, world, args.hidden)", "GRUPolicy(init, world)"])
 def test_other_networks_train_are_saved_and_play(policy, folder, tmp_path):
     name = policy.partition("(")[0]
-    changed = (ROOT / "algos" / "pg.py").read_text().replace("def build(", example(f"class {name}") + "\n\ndef build(", 1)
+    changed = (
+        (ROOT / "algos" / "pg.py")
+        .read_text(encoding="utf-8")
+        .replace("def build(", example(f"class {name}") + "\n\ndef build(", 1)
+    )
     made = "StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])"
     changes = {made: policy, "rollout.play(team.policy.params, act)": "rollout.play_with(team.policy.player(), act)"}
     if name == "GRUPolicy":
@@ -132,7 +138,7 @@ def test_other_networks_train_are_saved_and_play(policy, folder, tmp_path):
 
 def test_the_example_of_a_bonus_takes_the_place_of_the_window(folder, tmp_path):
     bonus = example("class VisitNovelty")
-    script = (ROOT / "algos" / "decespg.py").read_text()
+    script = (ROOT / "algos" / "decespg.py").read_text(encoding="utf-8")
     changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: bonus + "\n\n", script, flags=re.DOTALL)
     changed = changed.replace("import numpy as np\n", "from collections import defaultdict\n\nimport numpy as np\n", 1)
     assert changed.count("class VisitNovelty") == 1

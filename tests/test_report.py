@@ -27,8 +27,8 @@ def test_the_published_tables_are_those_of_the_kept_results(kept):
     assert len(kept) >= 54
     assert {result.num_episodes for result in kept.values()} == {10_000, 20_000}
     assert all(len(result.about["commit"]) == 40 for result in kept.values())
-    assert report.markdown(report.best_table(kept)) in report.README.read_text()
-    text = (report.DOCS / "results.md").read_text()
+    assert report.markdown(report.best_table(kept)) in report.README.read_text(encoding="utf-8")
+    text = (report.DOCS / "results.md").read_text(encoding="utf-8")
     for table in (report.score_table, report.difference_table, report.leaderboard):
         assert report.markdown(table(kept)) in text
 

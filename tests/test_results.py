@@ -82,7 +82,7 @@ def test_a_result_is_put_together_from_blocks_of_seeds(tmp_path):
         assert results.finished(parts, num_episodes=250) == {}
         cell, block = Cell("pg", "pushbox", "adam", first, end - first, num_episodes=250), slice(first - 1, end - 1)
         folder = write_run(cell, parts / str(first), returns[block], lengths[block], outcomes[block])
-        about = json.loads((folder / "args.json").read_text())
+        about = json.loads((folder / "args.json").read_text(encoding="utf-8"))
         (folder / "args.json").write_text(json.dumps({**about, "commit": "b" if first == 6 else "a"}))
     ((_, result),) = results.finished(parts, num_episodes=250).items()
     for name in ("score", "at_best", "steps", "last", "usual"):

@@ -345,7 +345,7 @@ def test_what_a_policy_carries_along_belongs_to_a_trial_whatever_ends_when():
 
 
 def test_an_edited_world_plays_by_its_new_rules(tmp_path):
-    path, text = tmp_path / "race.py", RACE.read_text()
+    path, text = tmp_path / "race.py", RACE.read_text(encoding="utf-8")
     assert text.count("REWARD = 10.0\n") == 1
     for reward in (10.0, -2.0):
         path.write_text(text.replace("REWARD = 10.0\n", f"REWARD = {reward}\n"))
@@ -361,10 +361,13 @@ def test_an_edited_world_plays_by_its_new_rules(tmp_path):
     ("text", "said"),
     [
         ("import envs", "must define one subclass of envs.World, not 0"),
-        (RACE.read_text() + "\n\nclass Other(Race):\n    pass\n", "must define one subclass of envs.World, not 2"),
+        (
+            RACE.read_text(encoding="utf-8") + "\n\nclass Other(Race):\n    pass\n",
+            "must define one subclass of envs.World, not 2",
+        ),
         ("1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
         ("def", "cannot be imported: SyntaxError"),
-        (RACE.read_text().replace("@envs.rule\n", ""), "must be functions compiled by envs.rule"),
+        (RACE.read_text(encoding="utf-8").replace("@envs.rule\n", ""), "must be functions compiled by envs.rule"),
     ],
 )
 def test_a_file_without_a_world_says_what_is_wrong(text, said, tmp_path):

@@ -73,7 +73,7 @@ def test_the_actors_weights_are_the_first_draws_and_each_trial_has_its_own_strea
 def test_a_time_limit_among_the_options_of_the_world_counts(tmp_path):
     words = ["--env-args", "max_steps=7", "--max-steps", "9", "--num-episodes", "2", "--run-dir", tmp_path]
     assert command("pg", *words).code == 0
-    assert json.loads((tmp_path / "args.json").read_text())["args"]["max_steps"] == 7
+    assert json.loads((tmp_path / "args.json").read_text(encoding="utf-8"))["args"]["max_steps"] == 7
     assert results(tmp_path)["lengths"].max() <= 7
 
 
@@ -105,7 +105,7 @@ def test_a_run_leaves_its_files_and_says_how_it_ended(finished):
 
 
 def test_args_json_holds_all_resolved_arguments_and_versions(finished):
-    about = json.loads((finished[0] / "args.json").read_text())
+    about = json.loads((finished[0] / "args.json").read_text(encoding="utf-8"))
     assert about["method"] == "pg"
     assert about["args"].keys() == {*vars(pg.Args())}
     given = dict(env="findtreasure", env_args=["size=9"], seed=5, num_trials=2, num_episodes=250, max_steps=40, hidden=[16])
@@ -260,7 +260,7 @@ def test_evaluate_overwrites_nothing_unasked(policy_file):
     film = Path(policy_file).with_suffix(".gif")
     film.write_text("mine")
     assert_refusal("pg", command("pg", "--evaluate", policy_file, "--num-episodes", 1), "is there already")
-    assert film.read_text() == "mine"
+    assert film.read_text(encoding="utf-8") == "mine"
     shutil.copy(policy_file, film)  # a model that is named like a film
     before = film.read_bytes()
     for words in ([], ["--overwrite"]):
@@ -584,6 +584,9 @@ BAD_INPUT = {
     "--resume": "there is nothing to resume",
     "--run-dir file": "cannot write to file",
     "--run-dir file/below": "cannot write to file/below",
+    f"--run-dir {'x' * 300}": "File name too long",
+    f"--evaluate {'x' * 300}": "there is no file",
+    f"--env {'x' * 300}.py": "there is no file",
     "--run-dir .": "--run-dir must name a directory of its own",
     "--evaluate file": "file is not a policy.pt",
     "--evaluate missing.pt": "missing.pt",
@@ -627,7 +630,7 @@ def test_what_does_not_fit_into_memory_is_refused(name, words, files):
 def test_numbers_of_numpy_are_numbers(tmp_path):
     args = dict(num_episodes=np.int64(2), num_trials=np.int8(1), seed=np.uint8(3), gamma=np.float32(0.5), max_steps=np.int16(3))
     train(pg, tmp_path, **args)
-    about = json.loads((tmp_path / "args.json").read_text())["args"]
+    about = json.loads((tmp_path / "args.json").read_text(encoding="utf-8"))["args"]
     assert [about[name] for name in args] == [2, 1, 3, 0.5, 3]
 
 

@@ -30,7 +30,7 @@ from tests.helpers import (
     script,
 )
 
-SOURCES = {f"{name}.py": (ALGOS / f"{name}.py").read_text() for name in SCRIPTS}
+SOURCES = {f"{name}.py": (ALGOS / f"{name}.py").read_text(encoding="utf-8") for name in SCRIPTS}
 
 
 # --- imports and sizes ---
@@ -175,7 +175,7 @@ def squeezed(text):
 def test_help_explains_every_argument(name):
     ended = command(name, "--help")
     assert (ended.code, ended.err) == (0, "")
-    run_source = (ALGOS.parent / "envs" / "run.py").read_text()
+    run_source = (ALGOS.parent / "envs" / "run.py").read_text(encoding="utf-8")
     own = parts_of(name, SOURCES[f"{name}.py"])
     for field in fields(script(name).Args):
         part = own.get(f"Args.{field.name}")
@@ -224,7 +224,7 @@ def test_a_world_of_ones_own_gets_the_values_that_the_help_names(name, tmp_path,
     ended = command(name, "--env", RACE, "--env-args", "size=3", "--num-episodes", 4, "--save-model", "--capture-video")
     assert ended.code == 0, ended.err
     directory = tmp_path / "runs" / "race" / name / "seed1-env_args=size=3-num_episodes=4"
-    args = json.loads((directory / "args.json").read_text())["args"]
+    args = json.loads((directory / "args.json").read_text(encoding="utf-8"))["args"]
     assert (args["max_steps"], results(directory)["lengths"].shape) == (20, (1, 4))
     text_of = {what: part.text for what, part in parts_of(name, SOURCES[f"{name}.py"]).items()}
     for field, value in script(name).OTHER.items():

@@ -36,7 +36,7 @@ def slurm():
     if jobs := run("squeue", "-h", "-o", "%A").split():
         run("scancel", *jobs)
         wait_until(lambda: not run("squeue", "-h"), 30)
-    for number in reversed((folder / "pids").read_text().split()):
+    for number in reversed((folder / "pids").read_text(encoding="utf-8").split()):
         os.kill(int(number), signal.SIGTERM)
     shutil.rmtree(folder, ignore_errors=True)
 
@@ -83,7 +83,7 @@ def test_a_requeued_task_and_a_lost_node_change_nothing(slurm, tmp_path):
     wait_until(lambda: comes_back(node), 30)
     wait_until(lambda: pg.finished and decespg.finished, 120)
 
-    assert decespg.log.read_text().count(" 0/6000 [00:00<?, ?ep/s, compiling") == 1  # it never began anew
+    assert decespg.log.read_text(encoding="utf-8").count(" 0/6000 [00:00<?, ?ep/s, compiling") == 1  # it never began anew
     assert "Restarts=2" in slurm("scontrol", "-o", "show", "job", task)
     for here, there in zip(cells(tmp_path / "here"), (pg, decespg), strict=True):
         with np.load(here.run_dir / "episodes.npz") as expected, np.load(there.run_dir / "episodes.npz") as found:

@@ -41,7 +41,7 @@ def test_a_table_is_read_as_it_was_written(table):
     again = tune.Table("decespg")
     assert again.rows == table.rows
     assert again.finished("pushbox", "sign")
-    lines = table.path.read_text().splitlines()
+    lines = table.path.read_text(encoding="utf-8").splitlines()
     assert len(lines) == 10
     assert [line for line in lines if line.endswith(",yes")] == ["pushbox,sign,0.001,10,2.6667,1.6667,8.0,yes"]
 
@@ -50,7 +50,7 @@ def test_rows_stand_in_the_order_of_the_grid(table):
     cells = table.cells("pushbox", "sign")
     for cell in reversed(cells):
         table.add(cell, (1, 1, 1))
-    found = [tuple(line.split(",")[:4]) for line in table.path.read_text().splitlines()[1:]]
+    found = [tuple(line.split(",")[:4]) for line in table.path.read_text(encoding="utf-8").splitlines()[1:]]
     assert found == [cell.key for cell in cells]
 
 

@@ -241,7 +241,7 @@ print(float(rollout.reward.max()))
 
     assert run() == ["100.0"] * 3
     world = tmp_path / "envs" / "findtreasure.py"
-    text = world.read_text()
+    text = world.read_text(encoding="utf-8")
     assert text.count("TREASURE_REWARD, MEETING_REWARD, BUMP_REWARD = 100.0,") == 1
     world.write_text(text.replace("BUMP_REWARD = 100.0,", "BUMP_REWARD = 70.0,"))
     assert run() == ["70.0"] * 3
