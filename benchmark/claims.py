@@ -23,7 +23,7 @@ from benchmark.cells import OPTIMIZERS, WORLDS, name_of
 from benchmark.figures import FIGURES
 from benchmark.report import DOCS, README, markdown, rewrite
 
-YES, PARTLY, NO, OPEN = "yes", "partly", "no", "open"
+YES, PARTLY, UNDECIDED, NO, OPEN = "yes", "partly", "undecided", "no", "open"
 BASELINES = ("pg", "ac", "coma", "acer", "dqn", "edti")
 POLICY_GRADIENT = ("pg", "ac", "coma", "acer", "edti")
 OURS = ("espg", "decespg")
@@ -60,10 +60,10 @@ class Cells:
         return ", ".join(f"{name_of(method)} {self.mean(method):.2f}" for method in methods)
 
     def minus(self, one, other):
-        """What one method has more than another: words, and YES, NO, or PARTLY where the interval has 0 in it."""
+        """What one method has more than another: words, and YES, NO, or UNDECIDED where the interval has 0 in it."""
         mean, low, high = measures.difference(self[one], self[other])
         words = f"{name_of(one)} - {name_of(other)} = {mean:+.2f} [{low:+.2f}, {high:+.2f}]"
-        return words, YES if low > 0 else NO if high < 0 else PARTLY
+        return words, YES if low > 0 else NO if high < 0 else UNDECIDED
 
     def minus_best_of(self, one, others):
         """The same against whichever of the others ends best."""
@@ -71,8 +71,8 @@ class Cells:
 
 
 def all_of(verdicts):
-    """YES if all are, NO if none is even partly."""
-    return YES if set(verdicts) == {YES} else NO if set(verdicts) == {NO} else PARTLY
+    """The verdict that all have; PARTLY if they differ."""
+    return verdicts[0] if len(set(verdicts)) == 1 else PARTLY
 
 
 def best_in_figure3(cells):
@@ -92,7 +92,7 @@ def worse_with_training(cells):
         change = last - first
         error = measures.mean_and_error(change)[1]
         words.append(f"{name_of(method)} {first.mean():.2f} in the first 100 episodes, {last.mean():.2f} in the end")
-        verdicts.append(YES if change.mean() < -2 * error else NO if change.mean() > 2 * error else PARTLY)
+        verdicts.append(YES if change.mean() < -2 * error else NO if change.mean() > 2 * error else UNDECIDED)
     return "; ".join(words), all_of(verdicts)
 
 
@@ -164,7 +164,7 @@ class Claim:
 
 
 WITH_LOCAL_OPTIMUM = ("findtreasure", "movebox", "pushbox")
-INTERVAL = "the 95 % interval of the difference over the trials of the same seeds lies above 0 (partly: has 0 in it)"
+INTERVAL = "the 95 % interval of the difference over the trials of the same seeds lies above 0 (undecided: has 0 in it)"
 CLAIMS = (
     Claim(
         "4.3",
@@ -273,7 +273,8 @@ def overall(rows):
     verdicts = {optimizer: {verdict for _, o, _, verdict in rows if o == optimizer} - {OPEN} for optimizer in OPTIMIZERS}
     seen, still_open = set.union(*verdicts.values()), sum(verdict == OPEN for *_, verdict in rows)
     only = [optimizer for optimizer in OPTIMIZERS if verdicts[optimizer] == {YES}]
-    word = {frozenset(): "open", frozenset({YES}): "reproduced", frozenset({NO}): "not reproduced"}.get(frozenset(seen))
+    alike = {YES: "reproduced", NO: "not reproduced", UNDECIDED: "undecided"}
+    word = "open" if not seen else alike.get(*seen) if len(seen) == 1 else ""
     word = word or (f"only under {only[0]}" if len(only) == 1 and YES not in verdicts[other(only[0])] else "partly")
     return word + (f" ({still_open} of {len(rows)} cases open)" if still_open and seen else "")
 
@@ -393,7 +394,7 @@ SENTENCES = (
         "20 trials end at the large box, at {coma_sign:.2f} per step (DecESPG {decespg_sign:.2f}). Under Adam {coma_adam_best} "
         "do (DecESPG {decespg_adam_best}), and DecESPG minus COMA is {adam}.",
         coma_in_pushbox,
-        lambda f: (f["sign_verdict"], f["adam_verdict"]) == (NO, PARTLY),
+        lambda f: (f["sign_verdict"], f["adam_verdict"]) == (NO, UNDECIDED),
     ),
     Sentence(
         "AC ends there in {ac_sign} (sign) and {ac_adam} (Adam) trials, PG, ACER, DQN and EDTI in at most {others}.",
@@ -422,7 +423,7 @@ SENTENCES = (
         "What the bonus adds to it cannot be told from nothing here: DecESPG minus SPG is {findtreasure_sign} (FindTreasure) "
         "and {pushbox_sign} (PushBox) under sign descent, {findtreasure_adam} and {pushbox_adam} under Adam.",
         two_differences("decespg", "spg"),
-        lambda f: set(verdicts_of(f)) == {PARTLY},
+        lambda f: set(verdicts_of(f)) == {UNDECIDED},
     ),
     Sentence(
         "Learnt novelty does as well in FindTreasure; in PushBox under Adam it keeps the large box in {decespg_ex2_adam} "

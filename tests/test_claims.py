@@ -83,6 +83,8 @@ def test_the_best_of_the_others_is_who_counts():
         ("no yes partly yes", "only under adam"),
         ("yes no yes yes", "partly"),
         ("partly partly partly partly", "partly"),
+        ("undecided undecided undecided open", "undecided (1 of 4 cases open)"),
+        ("yes undecided yes undecided", "only under sign"),
         ("yes open yes open", "reproduced (2 of 4 cases open)"),
         ("yes yes open open", "reproduced (2 of 4 cases open)"),
     ],
