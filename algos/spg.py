@@ -38,7 +38,7 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, slots=10),
     ("gotogether", "adam"): dict(learning_rate=3e-3, slots=10),
-    ("movebox", "sign"): dict(learning_rate=1e-3, slots=10),
+    ("movebox", "sign"): dict(learning_rate=3e-4, slots=3),
     ("movebox", "adam"): dict(learning_rate=3e-4, slots=10),
     ("pushbox", "sign"): dict(learning_rate=1e-4, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, slots=3),
