@@ -284,7 +284,7 @@ def assert_same_episodes(some, others):
 
 def assert_trials_are_runs(module, directory, tolerance, **args):
     """Trial k of three is the run with the seed of trial k: the same episodes, and weights within the tolerance."""
-    args = dict(args, num_episodes=200, max_steps=60)  # in which teams reach all ends of their worlds
+    args = dict(num_episodes=200, max_steps=60) | args  # in which teams reach all ends of their worlds
     together = train(module, directory / "together", seed=7, num_trials=3, **args)
     assert len({trial.tobytes() for trial in together.log.returns}) == 3  # no trial is another's copy
     for k in range(3):

@@ -24,7 +24,7 @@ ONE_KIND = ("pg", "epg", "spg", "espg", "decespg", "dqn")
 @pytest.mark.parametrize("name", ONE_KIND)
 def test_trials_are_runs_in_single_precision(name, tmp_path):
     """Only with one kind of networks: sign descent makes whole steps out of the rounding of what others say near 0."""
-    assert_trials_are_runs(script(name), tmp_path, 1e-5, env="pushbox")
+    assert_trials_are_runs(script(name), tmp_path, 1e-5, env="pushbox", max_steps=200)
 
 
 @each_script_and_setting
