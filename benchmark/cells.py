@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
 from envs import run
+from envs.command import one_line
 
 RUNS = ROOT / "runs" / "comparison"
 WORLDS = tuple(envs.WORLDS)
@@ -52,13 +53,20 @@ def path_of(method):
 
 @cache
 def script(method):
-    """A script as a module."""
+    """A script as a module; UsageError if it cannot be imported or is none."""
     path = path_of(method)
-    if path.parent == ROOT / "algos":
-        return importlib.import_module(f"algos.{path.stem}")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        if path.parent == ROOT / "algos":
+            module = importlib.import_module(f"algos.{path.stem}")
+        else:
+            spec = importlib.util.spec_from_file_location(path.stem, path)
+            module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
+            spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:  # the file may be anybody's
+        raise envs.UsageError(f"{path} cannot be imported: {type(error).__name__}: {one_line(error)}.") from error
+    for name in ("Args", "WORLDS", "TUNED", "OTHER", "train"):
+        if not hasattr(module, name):
+            raise envs.UsageError(f"{path} is no script for the comparison, because it has no {name}.")
     return module
 
 
@@ -143,6 +151,21 @@ class Cell:
         if shapes != {(self.num_trials, self.settings["num_episodes"])}:
             return f"{path} holds arrays of another shape"
         return "" if found == self.settings else f"{run_dir}/args.json is from other settings"
+
+
+def check_words(what, words, known):
+    """UsageError if one of the words is none of those that are known."""
+    for word in words:
+        if word not in known:
+            raise envs.UsageError(f"there is no {what} {word!r}; there is {', '.join(known)}.")
+
+
+def seconds_of(run_dir):
+    """The seconds that a run took, as ./benchmark.sh has noted them; nan if it has not, or not to the end."""
+    try:
+        return float((run_dir / "seconds").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return float("nan")
 
 
 def seeds_of(text):

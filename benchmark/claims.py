@@ -22,6 +22,7 @@ from benchmark import measures, results
 from benchmark.cells import OPTIMIZERS, WORLDS, name_of
 from benchmark.figures import FIGURES
 from benchmark.report import DOCS, README, markdown, rewrite
+from envs.command import command_line
 
 YES, PARTLY, UNDECIDED, NO, OPEN = "yes", "partly", "undecided", "no", "open"
 BASELINES = ("pg", "ac", "coma", "acer", "dqn", "edti")
@@ -464,4 +465,5 @@ def main(publish: bool = False):
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("claims.py"):
+        tyro.cli(main)

@@ -4,16 +4,17 @@ A cell is a script on a world with one optimiser and a block of seeds (20 trials
 whose result is there are skipped, interrupted ones go on from their checkpoint: kill this at any moment and call it again.
 """
 
+import contextlib
 import fcntl
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -22,8 +23,12 @@ from typing import Literal
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import envs
 from benchmark import results
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seeds_of, select
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seconds_of, seeds_of, select
+from envs.command import Forgiving, command_line
+
+ROOM = 100_000  # bytes without which a cell cannot even say what is wrong
 
 
 @dataclass
@@ -38,8 +43,8 @@ class Args:
     """first and last seed; all trials of a cell run side by side in one process"""
     episodes: int | None = None
     """training episodes of each trial (None: Table 1); a smoke run: --episodes 50"""
-    jobs: int = int(os.environ.get("JOBS", os.cpu_count() or 1))
-    """cells that run at the same time, one core each (also: the variable JOBS)"""
+    jobs: int | None = None
+    """cells that run at the same time, one core each (None: the variable JOBS, or else one for each core)"""
     checkpoint_every: float = 60.0
     """seconds between two checkpoints of a cell"""
     runs: Path = RUNS
@@ -71,7 +76,7 @@ def progress(cell):
         with cell.log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - 2000))
             counts = re.findall(rb"(\d+)/\d+ \[", file.read())
-    except FileNotFoundError:
+    except OSError:
         return 0
     return int(counts[-1]) if counts else 0
 
@@ -79,10 +84,12 @@ def progress(cell):
 def last_line(cell):
     """The last line of a cell's output."""
     lines = cell.log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n").split("\n") if cell.log.exists() else []
-    return next((line.strip() for line in reversed(lines) if line.strip()), "no output")
+    full = "no output, for the disk is full"
+    silent = full if cell.run_dir.exists() and shutil.disk_usage(cell.run_dir).free < ROOM else "no output"
+    return next((line.strip() for line in reversed(lines) if line.strip()), silent)
 
 
-@contextmanager
+@contextlib.contextmanager
 def owned(cell, wait=True):
     """Own a cell's directory: yields an open file whose lock lasts as long as any process holds it, None if another does."""
     cell.run_dir.mkdir(parents=True, exist_ok=True)
@@ -117,9 +124,17 @@ class Job:
     def __init__(self, cell, checkpoint_every):
         self.cell, self.checkpoint_every = cell, checkpoint_every
         self.process, self.code, self.seconds, self.stopped = None, None, 0.0, False
+        self.trouble = ""  # what kept this runner, not the script, from its work
 
     def run(self):
         """Run the cell from where it stands, unless it is finished; waits for another process that runs it already."""
+        try:
+            self._run()
+        except OSError as error:  # a full disk, a directory without permission; what the script has done counts all the same
+            self.trouble = f"cannot use {error.filename or self.cell.run_dir}: {error.strerror}"
+            self.code = 2 if self.code is None else self.code
+
+    def _run(self):
         cell, start = self.cell, time.monotonic()
         with owned(cell) as lock:
             if cell.finished or self.stopped:
@@ -136,9 +151,8 @@ class Job:
                 self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **kinds)
             self.code = self.process.wait()
             self.seconds = time.monotonic() - start
-            timed = cell.run_dir / "seconds"
-            before = float(timed.read_text()) if resume and timed.exists() else 0.0
-            timed.write_text(f"{before + self.seconds:.1f}\n")
+            before = seconds_of(cell.run_dir) if resume else 0.0
+            (cell.run_dir / "seconds").write_text(f"{before + self.seconds:.1f}\n")
             if self.code != 0 and not self.stopped:
                 (cell.run_dir / "exit_code").write_text(f"{self.code}\n")
 
@@ -216,8 +230,17 @@ def clock(seconds):
 
 def refuse(message):
     """End with one sentence and code 2."""
-    print(f"benchmark.sh: {message}", file=sys.stderr)
-    sys.exit(2)
+    raise envs.UsageError(message)
+
+
+def jobs_of(args):
+    """How many cells run at the same time."""
+    if args.jobs is not None:
+        return envs.check_whole("--jobs", args.jobs, minimum=1)
+    text = os.environ.get("JOBS") or str(os.cpu_count() or 1)
+    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) < 1:
+        refuse(f"the variable JOBS must be a whole number of at least 1, not {text!r}.")
+    return int(text)
 
 
 def selection(args):
@@ -230,13 +253,17 @@ def selection(args):
             refuse(f"there is no world {word!r}; there is {', '.join(WORLDS)}, or a file such as my_world.py.")
     if not (seeds := seeds_of(args.seeds)):
         refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
-    for name in ("episodes", "jobs"):
-        if (value := getattr(args, name)) is not None and value < 1:
-            refuse(f"--{name} must be a number of at least 1, not {value}.")
+    if args.episodes is not None:
+        envs.check_whole("--episodes", args.episodes, minimum=1)
+    envs.check_number("--checkpoint-every", args.checkpoint_every, lowest=0)
+    if args.runs.exists() and not args.runs.is_dir():
+        refuse(f"--runs must be a directory, which {args.runs} is not.")
     block = dict(first_seed=seeds[0], num_trials=seeds[1] - seeds[0] + 1, num_episodes=args.episodes, runs=args.runs.absolute())
     cells = select(args.algos, args.envs, args.optimizers, **block)
     if not cells:
         refuse("nothing is selected; a method without policies is run under adam only.")
+    for cell in cells:
+        cell.settings  # noqa: B018 - what is impossible is said before anything runs
     return cells
 
 
@@ -250,12 +277,14 @@ def show_states(cells):
         print(f"{number:>4}  {cell.name:<60} {word:<9} {detail}".rstrip())
 
 
-def submit(cells):
+def submit(args, cells):
     """Submit one job array over the unfinished cells; a task runs `./benchmark.sh <the same selection> --cell <its number>`."""
     numbers = [number for number, cell in enumerate(cells) if state(cell) not in ("finished", "running")]
     if not numbers:
         return print("All cells are finished or running.")
-    selected = [word for word in sys.argv[1:] if word != "--slurm"]
+    own = [word for word in sys.argv[1:] if word != "--slurm"]
+    files = {str(word): str(path_of(word)) for word in (*args.algos, *args.envs) if word.endswith(".py")}
+    selected = [*(files.get(word, word) for word in own), "--runs", str(args.runs.absolute())]  # the caller's, wherever it runs
     (ROOT / "runs" / "slurm").mkdir(parents=True, exist_ok=True)
     command = ["sbatch", f"--array={','.join(map(str, numbers))}", "benchmark/cell.sbatch", *selected]
     try:
@@ -273,29 +302,35 @@ def report(skipped, jobs, waiting):
     rest = len(waiting) + len(jobs) - len(failed) - len(finished)
     print(f"\n{len(finished)} finished, {len(failed)} failed, {len(skipped)} skipped (finished before), {rest} not finished")
     for job in failed:
-        print(f"  {job.cell.name}: code {job.code}: {last_line(job.cell)}")
+        print(f"  {job.cell.name}: code {job.code}: {job.trouble or last_line(job.cell)}")
         print(f"    again: {shlex.join([*job.cell.command, '--overwrite'])}")
     return 1 if failed else 143 if rest else 0
 
 
 def main():
-    """Run, list or show the cells of a selection."""
-    args = tyro.cli(Args, description=__doc__)
-    cells = selection(args)
+    """The command line."""
+    with command_line("benchmark.sh"):
+        run(tyro.cli(Args, prog="benchmark.sh", description=__doc__))
+
+
+def run(args):
+    """Run, list or show the cells of a selection; UsageError for what is impossible."""
+    cells, jobs = selection(args), jobs_of(args)
     if args.dry_run or args.status:
         return show_states(cells)
     if args.slurm:
-        return submit(cells)
+        return submit(args, cells)
     if args.cell is not None:
         if not 0 <= args.cell < len(cells):
             refuse(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")
         cells = [cells[args.cell]]
-    for cell in cells:
-        if cell.broken:
-            print(f"{cell.broken}; it is run again.")
-    skipped = [cell for cell in cells if cell.finished]
-    runner = Runner([cell for cell in cells if cell not in skipped], args.jobs, args.checkpoint_every)
-    sys.exit(report(skipped, runner.run(), runner.waiting))
+    with contextlib.redirect_stdout(Forgiving(sys.stdout)):  # no cell is left out because nobody listens
+        for cell in cells:
+            if cell.broken:
+                print(f"{cell.broken}; it is run again.")
+        skipped = [cell for cell in cells if cell.finished]
+        runner = Runner([cell for cell in cells if cell not in skipped], jobs, args.checkpoint_every)
+        sys.exit(report(skipped, runner.run(), runner.waiting))
 
 
 if __name__ == "__main__":

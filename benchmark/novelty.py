@@ -20,9 +20,11 @@ import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmark.cells import ROOT, name_of, script
+import envs
+from benchmark.cells import METHODS, ROOT, WORLDS, check_words, name_of, script
 from benchmark.figures import DASHES, colour_of
 from benchmark.report import markdown
+from envs.command import command_line
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -31,8 +33,11 @@ VISITS = 100
 
 
 def novelty_class(module):
-    """The name of a script's class that gives the exploration bonus."""
-    return next(name for name, value in vars(module).items() if isinstance(value, type) and hasattr(value, "bonus"))
+    """The name of a script's class that gives the exploration bonus; UsageError if there is none."""
+    for name, value in vars(module).items():
+        if isinstance(value, type) and hasattr(value, "bonus"):
+            return name
+    raise envs.UsageError(f"{Path(module.__file__).name} has no exploration bonus.")
 
 
 def bonuses_of_visits(method, args):
@@ -95,12 +100,22 @@ def main(
         num_trials: trials of each script
         num_episodes: episodes of each trial
     """
+    check_words("script", methods, METHODS)
+    check_words("world", worlds, WORLDS)
+    for name, number in (("--num-episodes", num_episodes), ("--num-trials", num_trials)):
+        envs.check_whole(name, number, minimum=1)
+    if not (methods and worlds):
+        raise envs.UsageError("--methods and --worlds must name at least one each.")
+    for method in methods:
+        novelty_class(script(method))
     curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th"]]
     for method in methods:
         for world in worlds:
             bonuses = curves[method, world] = bonuses_of_visits(
                 method, dict(env=world, num_trials=num_trials, num_episodes=num_episodes)
             )
+            if not len(bonuses):
+                raise envs.UsageError(f"no pair is visited {VISITS} times by {method} in {world}; train for more episodes.")
             first, tenth, hundredth = (bonuses[:, n - 1].mean() for n in (1, 10, VISITS))
             figures = [f"{value:.2f}" for value in (first, tenth, hundredth)]
             rows.append([method, world, str(len(bonuses)), *figures])
@@ -109,4 +124,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("novelty.py"):
+        tyro.cli(main)

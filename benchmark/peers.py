@@ -32,6 +32,7 @@ sys.path.insert(0, str(ROOT))
 import envs
 from algos import pg
 from benchmark.speed import print_table
+from envs.command import command_line
 
 SETTINGS = {world: {**pg.WORLDS[world], **pg.TUNED[world, "adam"]} for world in ("findtreasure", "pushbox")}
 ALONE = 3  # trials of those that run one after the other
@@ -325,6 +326,7 @@ def main(episodes: int = 500):
     Args:
         episodes: training episodes of each trial
     """
+    envs.check_whole("--episodes", episodes, minimum=1)
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # all threads of all libraries share one core
     torch.set_num_threads(1)
     head = ["what", "return at the end", "1 trial: us per step", ": pg", "20 trials: us per step", ": pg"]
@@ -351,4 +353,5 @@ def main(episodes: int = 500):
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("peers.py"):
+        tyro.cli(main)

@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark import figures, measures, results
 from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, seeds_of, select
+from envs.command import command_line
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
 HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -158,7 +159,7 @@ def settings_table():
 def versions(found):
     """The versions with which the results were made."""
     packages = ("python", "torch", "numpy", "numba", "gymnasium")
-    seen = {name: sorted({result.about[name] for result in found.values()}) for name in packages}
+    seen = {name: sorted({result.about.get(name, "unknown") for result in found.values()}) for name in packages}
     return ", ".join(f"{name} {' and '.join(numbers)}" for name, numbers in seen.items())
 
 
@@ -302,14 +303,17 @@ def publish(found, drawn):
 
 def refuse(message):
     """End with one sentence and code 2."""
-    print(f"report.py: {message}", file=sys.stderr)
-    sys.exit(2)
+    raise envs.UsageError(message)
 
 
 def main(args: Args):
     """Read what is finished, draw, write."""
     if not (seeds := seeds_of(args.seeds)):
         refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
+    if args.episodes is not None:
+        envs.check_whole("--episodes", args.episodes, minimum=1)
+    for path in args.scripts:
+        script(str(path))
     ours = seeds == (1, 20) and args.episodes is None
     if args.publish and not ours:
         refuse("only results of seeds 1-20 and all of Table 1's episodes are published.")
@@ -334,4 +338,5 @@ def main(args: Args):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args, description=__doc__))
+    with command_line("report.py"):
+        main(tyro.cli(Args, description=__doc__))

@@ -10,8 +10,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, WORLDS, Cell, path_of, script, settings_of
+from benchmark.cells import METHODS, OPTIMIZERS, ROOT, WORLDS, Cell, path_of, script, seconds_of, settings_of
 from envs import run
+from envs.command import one_line
 
 STORE = ROOT / "benchmark" / "results"
 BLOCK = 100  # episodes of which a point of a curve is the mean
@@ -53,7 +54,6 @@ class Result:
             return values[:, : blocks * BLOCK].reshape(trials, blocks, BLOCK)
 
         commits = sorted({about.get("commit", "") for about in abouts})
-        seconds = [float(text.read_text(encoding="utf-8")) for run_dir in run_dirs if (text := run_dir / "seconds").exists()]
         return cls(
             score=in_blocks(envs.reward_per_step(returns, lengths)).mean(2).astype(np.float32),
             at_best=in_blocks(outcomes == (world.best_outcome if world.outcome_names else -1)).mean(2).astype(np.float32),
@@ -61,7 +61,7 @@ class Result:
             last=log.means(recent)["reward_per_step"],
             usual=log.usual_outcomes(recent),
             actions=sample_episode(method or abouts[0]["method"], run_dirs[0] / "policy.pt", world.num_agents),
-            seconds=sum(seconds) if len(seconds) == len(run_dirs) else float("nan"),
+            seconds=sum(map(seconds_of, run_dirs)),
             num_episodes=num_episodes,
             about={**abouts[0], "commit": " and ".join(commits), "args": {**args, "num_trials": trials}},
         )
@@ -72,6 +72,7 @@ class Result:
         with np.load(path) as file:
             values = {name: file[name] for name in cls.__dataclass_fields__}
         about = json.loads(str(values.pop("about")))
+        about["method"], about["args"]["env"]  # without which nobody knows what it is
         return cls(**{name: value if value.ndim else value.item() for name, value in values.items()}, about=about)
 
     def save(self, path):
@@ -128,7 +129,15 @@ def finished(runs, seeds=(1, 20), num_episodes=None, scripts=()):
         elif own:
             blocks[found["env"], found["method"], optimizer][found["seed"], found["seed"] + found["num_trials"]] = file.parent
     wholes = {key: cover(parts, seeds[0], seeds[1] + 1) for key, parts in blocks.items()}
-    return in_order({key: Result.of_runs(parts, methods[key[1]]) for key, parts in wholes.items() if parts})
+    found = {}
+    for key, parts in wholes.items():
+        if not parts:
+            continue
+        try:
+            found[key] = Result.of_runs(parts, methods[key[1]])
+        except Exception as error:  # whatever can be wrong with a file, such as policy.pt
+            print(f"{parts[0]} cannot be taken in ({one_line(error)}) and is left out.", file=sys.stderr)
+    return in_order(found)
 
 
 def cover(parts, first, end):

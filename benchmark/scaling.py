@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
 from benchmark.speed import bonus_speed, print_table
+from envs.command import command_line
 
 TRIALS = 5
 
@@ -61,6 +62,9 @@ def main(num_episodes: int = 1000, windows: tuple[int, ...] = (50, 200, 800)):
         num_episodes: training episodes of each trial on cleaner
         windows: lengths m of the window
     """
+    envs.check_whole("--num-episodes", num_episodes, minimum=1)
+    for m in windows:
+        envs.check_memory(f"a window of {envs.check_whole('--windows', m, minimum=1)}", 16 * m * m)
     rows = [
         [method, observation, agents, *clean(method, agents, observation, num_episodes)]
         for observation in ("positions", "own")
@@ -74,4 +78,5 @@ def main(num_episodes: int = 1000, windows: tuple[int, ...] = (50, 200, 800)):
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("scaling.py"):
+        tyro.cli(main)

@@ -27,6 +27,7 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
+from envs.command import command_line
 
 EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
 EARLY = {"findtreasure": 200, "pushbox": 200, "gotogether": 20}  # in which teams still explore
@@ -142,8 +143,7 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
         quick: train for a tenth of Table 1's episodes
     """
     if not {"pg", "decespg"} <= set(methods) <= {path.stem for path in (ROOT / "algos").glob("*.py")}:
-        print("speed.py: the methods must be scripts of algos/ without .py, pg and decespg among them.", file=sys.stderr)
-        sys.exit(2)
+        raise envs.UsageError("the methods must be scripts of algos/ without .py, pg and decespg among them.")
     copies = (1, 20, 200)
     rows = [[name, *(f"{world_speed(name, n) / 1e6:.2f}" for n in copies)] for name in envs.WORLDS]
     print_table("Million environment steps per second:", ["copies of", *copies], rows)
@@ -194,4 +194,5 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("speed.py"):
+        tyro.cli(main)

@@ -31,7 +31,8 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import ROOT, has_policies
+from benchmark.cells import ROOT, check_words, has_policies
+from envs.command import command_line, one_line
 
 # A quarter of Table 1.
 EPISODES = {"findtreasure": 2500, "pushbox": 5000, "gotogether": 2500, "cleaner": 5000, "movebox": 5000}
@@ -130,8 +131,12 @@ class Table:
         self.lock = threading.Lock()
         if self.path.exists():
             with self.path.open(newline="", encoding="utf-8") as file:
-                _, *rows = csv.reader(file)
-            self.rows = {tuple(row[:4]): tuple(map(float, row[4:7])) for row in rows}
+                rows = list(csv.reader(file))
+            try:
+                self.rows = {tuple(row[:4]): tuple(map(float, row[4:7])) for row in rows[1:]}
+                sorted(self.rows.items(), key=order)
+            except ValueError as error:
+                raise envs.UsageError(f"{self.path} is no table of this program ({one_line(error)}).") from error
 
     def cells(self, world, optimizer):
         """The grid of one world and optimiser."""
@@ -178,7 +183,9 @@ def run_cells(tables, cells, jobs):
         try:
             tables[cell.method].add(cell, cell.run())
         except subprocess.CalledProcessError as error:
-            failed.append(f"{cell}: {error.stderr.strip().splitlines()[-1]}")
+            failed.append(f"{cell}: {(error.stderr.strip().splitlines() or ['no output'])[-1]}")
+        except Exception as error:  # whatever can be wrong with a file
+            failed.append(f"{cell}: {one_line(error)}")
         bar.update()
 
     with ThreadPoolExecutor(jobs) as pool:
@@ -203,10 +210,9 @@ def main(
         optimizers: optimisers of the policies to tune for
         jobs: runs at the same time, one core each
     """
-    for what, words, known in (("grid for the method", methods, OWN), ("world", worlds, EPISODES)):
-        for word in set(words) - set(known):
-            print(f"tune.py: there is no {what} {word!r}; there is {', '.join(known)}.", file=sys.stderr)
-            sys.exit(2)
+    check_words("grid for the method", methods, OWN)
+    check_words("world", worlds, EPISODES)
+    envs.check_whole("--jobs", jobs, minimum=1)
     tables = {method: Table(method) for method in methods}
     needed = [SAME_SIZE.get(world, world) for world in worlds]
     for stage in ([w for w in EPISODES if w in needed], [w for w in SAME_SIZE if w in worlds]):  # the second needs the first
@@ -219,4 +225,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("tune.py"):
+        tyro.cli(main)

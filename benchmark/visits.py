@@ -15,12 +15,14 @@ from typing import Literal
 import matplotlib
 import numpy as np
 import tyro
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.colors import LogNorm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, ROOT, WORLDS, has_policies, name_of, script
+from benchmark.cells import METHODS, ROOT, WORLDS, check_words, has_policies, name_of, script
 from benchmark.figures import agent_places
+from envs.command import command_line
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -98,10 +100,14 @@ def main(
         num_trials: trials of each script
         output: the picture
     """
-    for what, words, known in (("script", methods, METHODS), ("world", worlds, WORLDS)):
-        for word in set(words) - set(known):
-            print(f"visits.py: there is no {what} {word!r}; there is {', '.join(known)}.", file=sys.stderr)
-            sys.exit(2)
+    check_words("script", methods, METHODS)
+    check_words("world", worlds, WORLDS)
+    for name, number in (("--num-episodes", num_episodes), ("--num-trials", num_trials)):
+        envs.check_whole(name, number, minimum=1)
+    if not (methods and worlds):
+        raise envs.UsageError("--methods and --worlds must name at least one each.")
+    if output.suffix[1:] not in FigureCanvasBase.filetypes or not output.absolute().parent.is_dir():  # after hours is too late
+        raise envs.UsageError(f"--output must be a picture such as visits.png in a directory that is there, not {output}.")
     found = {}
     for method in methods:
         for name in worlds:
@@ -113,4 +119,5 @@ def main(
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("visits.py"):
+        tyro.cli(main)

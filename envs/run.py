@@ -384,8 +384,12 @@ def writing_to(place):
     """UsageError instead of an OSError: a full disk, a directory without permission, a name that is too long."""
     try:
         yield
-    except OSError as error:
-        raise envs.UsageError(f"cannot write to {place}: {error.strerror or error}.") from error
+    except (OSError, RuntimeError) as error:
+        # torch.save, when it cannot write, complains of its own archive, and what came first stands behind that.
+        reason = error if isinstance(error, OSError) else error.__context__
+        if not isinstance(reason, OSError):
+            raise
+        raise envs.UsageError(f"cannot write to {place}: {reason.strerror or reason}.") from error
 
 
 def commit_of(directory):

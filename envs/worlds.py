@@ -51,7 +51,7 @@ def world_in_file(path):
         spec.loader.exec_module(module)
     except UsageError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise UsageError(f"{path} cannot be imported: {type(error).__name__}: {reason}.") from error
     found = [

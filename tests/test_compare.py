@@ -1,6 +1,7 @@
 """benchmark.sh: its cells, what it skips, runs again and goes on with, what it says of failures, and real kills."""
 
 import dataclasses
+import io
 import json
 import os
 import re
@@ -9,12 +10,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmark import compare, figures, report, results
-from benchmark.cells import ROOT, Cell, select
+from benchmark.cells import ROOT, Cell, seconds_of, select
 from tests.helpers import assert_one_sentence, script
 
 BLOCK = dict(first_seed=5, num_trials=2, num_episodes=6000)
@@ -271,15 +273,108 @@ def test_without_slurm_nothing_is_submitted(tmp_path, monkeypatch, capsys):
         ("--envs pacman", "'pacman'"),
         ("--seeds 5-2", "'5-2'"),
         ("--seeds x", "'x'"),
+        ("--seeds 1-100000000000000000000", "'1-100000000000000000000'"),
+        ("--seeds 1-999999999 --dry-run", "a log of 999999999 x 20000 episodes would need"),
         ("--episodes 0", "not 0"),
+        ("--episodes 1000000000000 --dry-run", "would need 260,000 GB of memory"),
+        ("--episodes 1000000000000000000000", "between 1 and 9223372036854775807"),
         ("--jobs 0", "not 0"),
+        ("--jobs 1000000000000000000000", "between 1 and 9223372036854775807"),
+        ("--checkpoint-every nan", "at least 0, not nan"),
+        ("--checkpoint-every -1", "at least 0, not -1"),
+        (f"--runs {__file__}", "--runs must be a directory"),
+        (f"--algos {Path(__file__).parent / 'data' / 'race.py'}", "is no script for the comparison, because it has no Args"),
+        (f"--envs {ROOT / 'algos' / 'pg.py'}", "must define one subclass of envs.World, not 0"),
         ("--cell -1", "not -1"),
         ("--cell 100000", "not 100000"),
     ],
 )
 def test_bad_input_is_refused_in_one_sentence(words, said, monkeypatch, capsys):
+    monkeypatch.setattr(compare.Runner, "run", lambda self: pytest.fail("nothing must be run"))
     code, out, err = command(monkeypatch, capsys, *words.split())
     assert (code, out) == (2, "")
     assert err.startswith("benchmark.sh: ")
     assert said in err
     assert_one_sentence(err.removesuffix("\n"))
+
+
+@pytest.mark.parametrize("jobs", ["all", "0", "-1", "1.5", "100000000000000000000"])
+def test_the_variable_jobs_is_a_number(jobs, monkeypatch, capsys):
+    monkeypatch.setenv("JOBS", jobs)
+    code, out, err = command(monkeypatch, capsys, *SMALL, "--dry-run")
+    assert (code, out) == (2, "")
+    assert err == f"benchmark.sh: the variable JOBS must be a whole number of at least 1, not {jobs!r}.\n"
+    assert command(monkeypatch, capsys, *SMALL, "--dry-run", "--jobs", 1)[0] == 0
+
+
+def test_it_is_called_from_anywhere_and_through_a_link(tmp_path):
+    """Files and directories that it is told are the caller's."""
+    (tmp_path / "bench").symlink_to(ROOT / "benchmark.sh")
+    (tmp_path / "my_world.py").write_bytes((ROOT / "tests" / "data" / "race.py").read_bytes())
+    words = ["./bench", *SMALL, "--envs", "my_world.py", "--cell", "0", "--runs", "mine"]
+    environment = {**os.environ, "PYTHON": sys.executable}
+    ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert len(list((tmp_path / "mine" / "my_world" / "pg").glob("*/episodes.npz"))) == 1
+
+
+def test_an_array_of_jobs_is_told_the_callers_files(tmp_path, monkeypatch, capsys):
+    (tmp_path / "my_world.py").write_bytes((ROOT / "tests" / "data" / "race.py").read_bytes())
+    (tmp_path / "sbatch").write_text('#!/bin/sh\necho "$@" > told\n'.replace("told", str(tmp_path / "told")), encoding="utf-8")
+    (tmp_path / "sbatch").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    monkeypatch.chdir(tmp_path)
+    code, _, _ = command(monkeypatch, capsys, *SMALL, "--envs", "my_world.py", "--runs", "mine", "--slurm")
+    told = (tmp_path / "told").read_text(encoding="utf-8").split()
+    assert (code, told[:2]) == (0, ["--array=0,1", "benchmark/cell.sbatch"])
+    monkeypatch.chdir(ROOT)
+    _, said, _ = command(monkeypatch, capsys, *told[2:], "--dry-run")
+    assert [line.split()[1].split("/")[:2] for line in said.splitlines()] == [["my_world", "pg"], ["my_world", "decespg"]]
+    assert str(tmp_path / "mine") in told
+
+
+def test_a_time_that_was_not_written_to_its_end_is_none(cell):
+    finish(cell)
+    timed = cell.run_dir / "seconds"
+    for text in ("", "12.", "abc", "12.5\n"):
+        timed.write_text(text, encoding="utf-8")
+        assert seconds_of(cell.run_dir) == pytest.approx(float(text) if text.strip("abc") else np.nan, nan_ok=True)
+    timed.unlink()
+    assert np.isnan(seconds_of(cell.run_dir))
+
+
+def test_a_cell_goes_on_though_its_time_is_lost(tmp_path, monkeypatch, capsys):
+    cell = Cell("pg", "pushbox", "sign", num_trials=1, num_episodes=2, runs=tmp_path)
+    cell.run_dir.mkdir(parents=True)
+    (cell.run_dir / "seconds").write_text("", encoding="utf-8")
+    (cell.run_dir / "checkpoint.pt").write_bytes(b"none")  # so that it is resumed, and refused
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--cell", 0, "--runs", tmp_path)
+    assert (code, "checkpoint.pt cannot be read" in said) == (1, True)
+    assert (cell.run_dir / "seconds").read_text(encoding="utf-8") == "nan\n"
+
+
+def test_a_full_disk_is_said_to_be_full(tmp_path, monkeypatch, capsys):
+    failing = property(lambda self: [sys.executable, "-c", "import sys; sys.exit(2)"])
+    monkeypatch.setattr(Cell, "command", failing)
+    monkeypatch.setattr(compare.shutil, "disk_usage", lambda path: SimpleNamespace(free=0))
+    code, said, _ = command(monkeypatch, capsys, *SMALL, "--runs", tmp_path)
+    assert (code, said.count("code 2: no output, for the disk is full")) == (1, 2)
+
+
+def test_a_directory_that_cannot_be_made_is_named(tmp_path, monkeypatch, capsys):
+    (tmp_path / "pushbox").write_text("mine", encoding="utf-8")
+    code, said, err = command(monkeypatch, capsys, *SMALL, "--runs", tmp_path)
+    assert (code, err) == (1, "")
+    assert "2 failed" in said
+    assert f"code 2: cannot use {tmp_path / 'pushbox'}" in said
+    assert (tmp_path / "pushbox").read_text(encoding="utf-8") == "mine"
+
+
+def test_cells_are_run_though_nobody_listens(tmp_path, monkeypatch, capsys):
+    class Deaf(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(sys, "stdout", Deaf())
+    assert command(monkeypatch, capsys, *SMALL, "--cell", 0, "--runs", tmp_path)[0] == 0
+    assert len(list(tmp_path.rglob("episodes.npz"))) == 1

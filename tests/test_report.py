@@ -8,7 +8,7 @@ import pytest
 
 from benchmark import figures, report, results
 from benchmark.cells import METHODS, Cell
-from tests.helpers import BEST_PLANS, script, train
+from tests.helpers import BEST_PLANS, assert_refused, script, train
 
 
 @pytest.fixture(scope="module")
@@ -120,13 +120,11 @@ def test_a_smoke_run_has_a_report_of_its_own(tmp_path, monkeypatch, capsys):
         (dict(), "there is no finished cell under "),
         (dict(publish=True, episodes=50), "only results of seeds 1-20 and all of Table 1's episodes are published."),
         (dict(publish=True, seeds="1-3"), "only results of seeds 1-20 and all of Table 1's episodes are published."),
+        (dict(episodes=0), "--episodes must be a whole number of at least 1, not 0."),
         (dict(seeds="3-1"), "--seeds must be two numbers such as 1-20, not '3-1'."),
     ],
 )
-def test_what_cannot_be_reported(args, said, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_reported(args, said, tmp_path, monkeypatch):
     monkeypatch.setattr(results, "STORE", tmp_path / "store")
-    with pytest.raises(SystemExit) as error:
-        report.main(report.Args(runs=tmp_path, output_dir=tmp_path / "report", **args))
-    assert error.value.code == 2
-    assert capsys.readouterr().err.startswith(f"report.py: {said}")
+    assert_refused(said, report.main, report.Args(runs=tmp_path, output_dir=tmp_path / "report", **args))
     assert not (tmp_path / "report").exists()

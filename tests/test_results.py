@@ -117,6 +117,24 @@ def test_what_is_broken_is_named_and_left_out(tmp_path, store, capsys):
     assert f"{kept} cannot be read" in capsys.readouterr().err
 
 
+def test_one_broken_or_foreign_run_leaves_the_others(tmp_path, capsys):
+    some_run(tmp_path / "own")
+    (some_run(tmp_path / "time")[0] / "seconds").write_text("", encoding="utf-8")
+    assert np.isnan(Result.of_runs([tmp_path / "time" / "a" / "b"]).seconds)
+    shutil.rmtree(tmp_path / "time")
+    for name, about in {"list": [], "no-args": {"method": "pg"}, "odd": {"method": ["pg"], "args": 3}}.items():
+        folder = some_run(tmp_path / name)[0]
+        (folder / "args.json").write_text(json.dumps(about), encoding="utf-8")
+    some_run(tmp_path / "types", seed="one")
+    some_run(tmp_path / "world", env="missing.py")
+    (tmp_path / "loop").symlink_to(tmp_path)
+    assert list(results.finished(tmp_path, num_episodes=250)) == [("pushbox", "pg", "adam")]
+    assert len(capsys.readouterr().err.splitlines()) == 5
+    (tmp_path / "own" / "a" / "b" / "policy.pt").write_bytes(b"none")
+    assert results.finished(tmp_path / "own", num_episodes=250) == {}
+    assert "policy.pt is not a policy.pt" in capsys.readouterr().err
+
+
 def test_an_episode_of_the_first_team_is_kept(tmp_path):
     args = dict(env="findtreasure", seed=1, num_trials=2, num_episodes=400, learning_rate=3e-3, save_model=True)
     log = train(pg, tmp_path, **args).log

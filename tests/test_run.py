@@ -1,5 +1,7 @@
 """What a run keeps, which is the same for all scripts: its files, curves, checkpoints and refusals, and `--evaluate`."""
 
+import contextlib
+import io
 import json
 import os
 import random
@@ -546,6 +548,28 @@ def test_a_full_disk_gives_one_sentence_and_keeps_the_last_checkpoint(interrupte
     assert ended.err.splitlines()[-1] == f"decespg.py: cannot write to {directory}: No space left on device."
     assert (directory / "checkpoint.pt").read_bytes() == before
     assert not [path for path in directory.iterdir() if path.name.startswith(".checkpoint")]
+
+
+@pytest.mark.parametrize("after", [0, 3000])
+def test_a_disk_that_is_full_within_a_file_gives_one_sentence(after, tmp_path, monkeypatch):
+    """Of which torch says something else."""
+
+    class Full(io.BytesIO):
+        def write(self, data):
+            if self.tell() + len(data) > after:
+                raise OSError(28, "No space left on device")
+            return super().write(data)
+
+    @contextlib.contextmanager
+    def on_a_full_disk(path):
+        with Full() if path.suffix == ".pt" else complete_file(path) as file:
+            yield file
+
+    complete_file = envs.complete_file
+    monkeypatch.setattr(envs, "complete_file", on_a_full_disk)
+    ended = command("pg", "--num-episodes", 2, "--max-steps", 5, "--save-model", "--run-dir", tmp_path / "run")
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err.splitlines()[-1] == f"pg.py: cannot write to {tmp_path / 'run'}: No space left on device."
 
 
 # --- bad input ---

@@ -1,8 +1,11 @@
 """The tuning rule: its grid, which cell it chooses, and the tables that it keeps."""
 
+import zipfile
+
 import pytest
 
 from benchmark import tune
+from tests.helpers import assert_refused
 
 
 @pytest.fixture
@@ -74,10 +77,26 @@ def test_a_failed_run_is_shown_and_leaves_no_row(table, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("words", [dict(methods=("ppo",)), dict(methods=("pg",), worlds=("pacman",))])
-def test_unknown_words_are_refused(words, capsys):
+def test_unknown_words_are_refused(words):
+    assert_refused("there is no ", tune.main, **words)
+
+
+def test_a_table_that_is_none_is_refused(table):
+    table.path.parent.mkdir()
+    for text in ("", "a,b\n"):
+        table.path.write_text(text, encoding="utf-8")
+        assert not tune.Table("decespg").rows
+    for text in ("head\npushbox,sign,0.001,1,x,1,1,\n", "head\nmars,sign,0.001,1,1,1,1,\n", "head\npushbox\n"):
+        table.path.write_text(text, encoding="utf-8")
+        assert_refused("is no table of this program", tune.Table, "decespg")
+
+
+def test_a_result_that_cannot_be_read_does_not_stop_the_others(table, monkeypatch, capsys):
+    def fails(self):
+        raise zipfile.BadZipFile("File is not a zip file")
+
+    monkeypatch.setattr(tune.Cell, "run", fails)
     with pytest.raises(SystemExit) as end:
-        tune.main(**words)
-    assert end.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith("tune.py: there is no ")
-    assert len(said.splitlines()) == 1
+        tune.main(("decespg",), worlds=("pushbox",), optimizers=("sign",))
+    assert end.value.code == 1
+    assert capsys.readouterr().err.count("File is not a zip file") == 9
