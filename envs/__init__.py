@@ -5,10 +5,13 @@
     rollout = envs.Rollout(world, num_trials=20)         # whole episodes, compiled
     print(envs.optimum("findtreasure"))                  # the exact optimum, by search
     envs.draw(world, world.start)                        # a picture; envs.save_gif makes a film of several
+    env = gymnasium.make_vec("CoopGrid/PushBox-v0", num_envs=20)    # as envs.make_vec("pushbox", num_envs=20)
 
 `envs.WORLDS` has the worlds by name; each one's module is its documentation. Wherever a name is asked for, a file with a world
 of your own will do: `python -m envs my_world.py` plays it in a terminal, as `python -m envs pushbox` does.
 """
+
+import gymnasium
 
 from envs.base import (
     PositionWorld,
@@ -30,6 +33,11 @@ from envs.search import Optimum, find_optimum
 from envs.statistics import EpisodeLog, reward_per_step
 from envs.vector import GridVectorEnv
 from envs.worlds import WORLDS, make_world, parse_options
+
+for _world in WORLDS.values():
+    _id = f"CoopGrid/{_world.__name__}-v0"
+    if _id not in gymnasium.registry:  # which warns of a second time
+        gymnasium.register(_id, vector_entry_point="envs:make_vec", kwargs={"name": _world.name})
 
 
 def make_vec(name: str, num_envs: int = 1, **options) -> GridVectorEnv:

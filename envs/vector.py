@@ -33,7 +33,7 @@ class GridVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = num_envs = check_whole("num_envs", num_envs, minimum=1)
         numbers = 3 * len(world.start) + world.local_index.size + world.num_agents * (world.obs_dim + 4)  # of a copy
         check_memory(f"{num_envs} copies of {world.name}", 8 * num_envs * numbers)
-        self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": ["rgb_array"]}
+        self.metadata = {"autoreset_mode": AutoresetMode.DISABLED, "render_modes": ["rgb_array"], "render_fps": 10}
         self.render_mode = "rgb_array"
         self.single_observation_space = gymnasium.spaces.Box(0.0, 1.0, (world.num_agents, world.obs_dim), np.float32)
         self.single_action_space = gymnasium.spaces.MultiDiscrete([world.num_actions] * world.num_agents)
