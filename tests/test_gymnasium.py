@@ -31,7 +31,8 @@ def test_impossible_options_are_refused():
 
 
 def test_one_import_is_enough_and_says_nothing():
-    code = f"import sys, gymnasium, envs; print(gymnasium.make_vec({IDS['movebox']!r}, num_envs=3).num_envs, 'torch' in sys.modules)"
+    made = f"gymnasium.make_vec({IDS['movebox']!r}, num_envs=3)"
+    code = f"import sys, gymnasium, envs; print({made}.num_envs, 'torch' in sys.modules)"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ALGOS.parent)
     assert (ended.stdout, ended.stderr) == ("3 False\n", "")
 
