@@ -43,7 +43,7 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03),
     ("gotogether", "adam"): dict(learning_rate=1e-3, beta=0.1),
-    ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3),
+    ("movebox", "sign"): dict(learning_rate=1e-4, beta=0.03),
     ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.3),
     ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, beta=1.0),
