@@ -1,8 +1,10 @@
 """The comparison's unit of work: a cell is a script on a world with one optimiser and a block of seeds, run in one process."""
 
+import contextlib
 import hashlib
 import importlib
 import importlib.util
+import io
 import json
 import os
 import re
@@ -12,6 +14,7 @@ from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
+import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -86,21 +89,45 @@ class Cell:
     num_trials: int = 20
     num_episodes: int | None = None  # None: Table 1
     runs: Path = RUNS  # under which the cells work
+    env_args: tuple[str, ...] = ()  # options of the world, such as "size=6"
+    own: tuple[tuple[str, str], ...] = ()  # arguments of the script that are not at their defaults, and their values
 
     @property
     def arguments(self):
-        """What the script is told, {argument: value}."""
+        """What the script is told besides `env_args` and `own`, {argument: value}."""
         world = self.world if self.world in WORLDS else str(Path(self.world).resolve())
         told = dict(env=world, seed=self.first_seed, num_trials=self.num_trials)
         if has_policies(self.method):
             told["optimizer"] = self.optimizer
         return told if self.num_episodes is None else {**told, "num_episodes": self.num_episodes}
 
+    @property
+    def words(self):
+        """All that the script is told, as words of its command line."""
+        told = {name: [str(value)] for name, value in self.arguments.items()}
+        told |= {"env_args": self.env_args} if self.env_args else {}
+        told |= {name: value.split() for name, value in self.own}
+        return [word for name, values in told.items() for word in (run.option(name), *values)]
+
+    def parsed(self):
+        """The script's Args; UsageError for an argument that it does not take."""
+        module = script(self.method)
+        if not (self.env_args or self.own):
+            return module.Args(**self.arguments)
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):
+                return tyro.cli(module.Args, args=self.words)
+        except SystemExit as error:
+            own = " ".join(f"{name}={value}" for name, value in self.own)
+            raise envs.UsageError(
+                f"{path_of(self.method).name} does not take {own or self.env_args}; see its --help."
+            ) from error
+
     @cached_property
     def settings(self):
         """Everything that the result depends on: the arguments with their defaults filled in, as args.json holds them."""
         module = script(self.method)
-        args, _ = run.resolve(module.Args(**self.arguments), module.WORLDS, module.TUNED, module.OTHER)
+        args, _ = run.resolve(self.parsed(), module.WORLDS, module.TUNED, module.OTHER)
         values = {name: value for name, value in vars(args).items() if name not in run.HOUSEKEEPING}
         return json.loads(json.dumps({"method": path_of(self.method).stem, **values}))
 
@@ -109,7 +136,8 @@ class Cell:
         """Short, unique among cells of the same settings."""
         seeds = f"{self.first_seed}-{self.first_seed + self.num_trials - 1}"
         where = f"{Path(self.world).stem}/{path_of(self.method).stem}"
-        return f"{where}/{self.optimizer}-seeds{seeds}-episodes{self.settings['num_episodes']}"
+        own = "".join(f"-{word}" for word in (*self.env_args, *(f"{name}={value}" for name, value in self.own)))
+        return f"{where}/{self.optimizer}-seeds{seeds}-episodes{self.settings['num_episodes']}{own.replace('/', '_')}"
 
     @property
     def run_dir(self):
@@ -125,9 +153,8 @@ class Cell:
     @property
     def command(self):
         """The command that runs the cell from its beginning."""
-        words = [word for name, value in self.arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
         script_file = os.path.relpath(path_of(self.method), ROOT)  # cells are run there
-        return [sys.executable, script_file, *words, "--run-dir", str(self.run_dir), "--save-model"]
+        return [sys.executable, script_file, *self.words, "--run-dir", str(self.run_dir), "--save-model"]
 
     @property
     def finished(self):

@@ -5,6 +5,7 @@ whose result is there are skipped, interrupted ones go on from their checkpoint:
 """
 
 import contextlib
+import dataclasses
 import fcntl
 import os
 import re
@@ -17,6 +18,7 @@ import threading
 import time
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -27,7 +29,9 @@ import envs
 from benchmark import results
 from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seconds_of, seeds_of, select
 from envs.command import Forgiving, command_line
+from envs.run import HOUSEKEEPING
 
+TOLD = ("env", "env_args", "seed", "num_trials", "num_episodes", "optimizer")  # by options of ./benchmark.sh
 ROOM = 100_000  # bytes without which a cell cannot even say what is wrong
 
 
@@ -43,6 +47,10 @@ class Args:
     """first and last seed; all trials of a cell run side by side in one process"""
     episodes: int | None = None
     """training episodes of each trial (None: Table 1); a smoke run: --episodes 50"""
+    env_args: tuple[str, ...] = ()
+    """options of the world, in all cells, such as size=6"""
+    args: tuple[str, ...] = ()
+    """arguments of the scripts, with one value or several to try: beta=0.1,0.3 learning_rate=1e-3,1e-4 are four cells each"""
     jobs: int | None = None
     """cells that run at the same time, one core each (None: the variable JOBS, or else one for each core)"""
     checkpoint_every: float = 60.0
@@ -259,12 +267,35 @@ def selection(args):
     if args.runs.exists() and not args.runs.is_dir():
         refuse(f"--runs must be a directory, which {args.runs} is not.")
     block = dict(first_seed=seeds[0], num_trials=seeds[1] - seeds[0] + 1, num_episodes=args.episodes, runs=args.runs.absolute())
-    cells = select(args.algos, args.envs, args.optimizers, **block)
+    cells = select(args.algos, args.envs, args.optimizers, env_args=args.env_args, **block)
+    cells = [dataclasses.replace(cell, own=own) for cell in cells for own in combinations(args.args)]
     if not cells:
         refuse("nothing is selected; a method without policies is run under adam only.")
     for cell in cells:
         cell.settings  # noqa: B018 - what is impossible is said before anything runs
     return cells
+
+
+def combinations(words):
+    """All ways to choose a value for each argument: beta=0.1,0.3 gives (("beta", "0.1"),) and (("beta", "0.3"),)."""
+    choices = []
+    for word in words:
+        name, equals, values = word.partition("=")
+        if not equals or not re.fullmatch(r"[a-z_]+", name) or not all(values.split(",")):
+            refuse(f"--args must be written argument=value or argument=value,value, not {word!r}.")
+        if name in (*TOLD, *HOUSEKEEPING):
+            refuse(f"--args must be arguments of the method, which {name!r} is not.")
+        choices.append([(name, value) for value in values.split(",")])
+    return list(product(*choices))
+
+
+def show_table(cells):
+    """What the finished cells have reached, as benchmark/plot.py says it."""
+    from benchmark import plot  # matplotlib takes a second, which no scheduler needs to wait
+
+    if finished := [cell.run_dir for cell in cells if cell.finished]:
+        scores, differences = plot.tables(plot.groups_of(plot.read(finished)))
+        print("", plot.markdown(scores), *([plot.markdown(differences)] if len(differences) > 1 else []), sep="\n\n")
 
 
 def show_states(cells):
@@ -330,7 +361,10 @@ def run(args):
                 print(f"{cell.broken}; it is run again.")
         skipped = [cell for cell in cells if cell.finished]
         runner = Runner([cell for cell in cells if cell not in skipped], jobs, args.checkpoint_every)
-        sys.exit(report(skipped, runner.run(), runner.waiting))
+        code = report(skipped, runner.run(), runner.waiting)
+        if args.cell is None:
+            show_table(cells)
+        sys.exit(code)
 
 
 if __name__ == "__main__":

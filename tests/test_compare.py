@@ -207,6 +207,54 @@ def test_a_selection_is_a_numbered_list():
     assert found[0].settings["num_episodes"] == 20_000
 
 
+def test_a_sweep_is_a_cell_for_every_combination_and_ends_with_its_table(tmp_path, monkeypatch, capsys):
+    words = [
+        "--algos",
+        "decespg",
+        "--envs",
+        "pushbox",
+        "--optimizers",
+        "sign",
+        "--seeds",
+        "1-2",
+        "--episodes",
+        "40",
+        "--runs",
+        tmp_path,
+    ]
+    sweep = [*words, "--env-args", "size=6", "--args", "beta=0.5,1", "window=5"]
+    code, said, _ = command(monkeypatch, capsys, *sweep)
+    assert (code, "2 finished, 0 failed" in said) == (0, True), said
+    assert "| pushbox | decespg beta=0.5 | 2 | 40 | " in said
+    assert "| pushbox | decespg beta=1.0 - decespg beta=0.5 | " in said
+    settings = [json.loads(path.read_text())["args"] for path in tmp_path.rglob("args.json")]
+    assert sorted((args["beta"], args["window"], args["env_args"]) for args in settings) == [
+        (b, 5, ["size=6"]) for b in (0.5, 1)
+    ]
+    _, said, _ = command(monkeypatch, capsys, *sweep, "--dry-run")
+    assert said.count("finished") == 2
+    _, said, _ = command(monkeypatch, capsys, *words, "--dry-run")
+    assert said.split()[-1] == "new"
+    assert results.finished(tmp_path, (1, 2), 40) == {}  # these are not the comparison's
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--args", "beta"], "--args must be written argument=value or argument=value,value, not 'beta'."),
+        (["--args", "beta=1,,2"], "--args must be written argument=value or argument=value,value, not 'beta=1,,2'."),
+        (["--args", "seed=3"], "--args must be arguments of the method, which 'seed' is not."),
+        (["--args", "betas=3"], "pg.py does not take betas=3; see its --help."),
+        (["--args", "gamma=x"], "pg.py does not take gamma=x; see its --help."),
+        (["--args", "gamma=7"], "--gamma must be a number between 0 and 1, not 7.0."),
+        (["--env-args", "size=5"], "pushbox's size must be one of 4, 6, 8, 10, not 5."),
+    ],
+)
+def test_impossible_sweeps(words, said, monkeypatch, capsys):
+    code, _, error = command(monkeypatch, capsys, "--algos", "pg", "--envs", "pushbox", *words, "--dry-run")
+    assert (code, error) == (2, f"benchmark.sh: {said}\n")
+
+
 # --- the runner ---
 
 

@@ -1,10 +1,12 @@
 """The commands and examples of README and docs/ do what they say."""
 
+import json
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -134,6 +136,19 @@ def test_other_networks_train_are_saved_and_play(policy, folder, tmp_path):
     said = python(tmp_path, "algos/mine.py", *words, "--run-dir", "run", "--optimizer", "adam")
     assert "2 trials, usual end: " in said
     assert "5 episodes of 2 teams" in python(tmp_path, "algos/mine.py", "--evaluate", "run/policy.pt", "--num-episodes", 5)
+
+
+def test_the_example_of_a_search_trains_with_what_is_chosen(tmp_path, monkeypatch):
+    """A stand-in for Optuna that chooses the lowest values, once."""
+    monkeypatch.chdir(tmp_path)
+    trial = SimpleNamespace(number=0, suggest_float=lambda name, low, high, log: low)
+    study = SimpleNamespace(optimize=lambda objective, n_trials: results.append(objective(trial)))
+    results, optuna = [], SimpleNamespace(create_study=lambda direction: study)
+    monkeypatch.setitem(sys.modules, "optuna", optuna)
+    exec(example("import optuna").replace("num_episodes=5000", "num_episodes=300"), {})
+    args = json.loads((tmp_path / "runs" / "optuna" / "0" / "args.json").read_text())["args"]
+    assert (args["learning_rate"], args["beta"], args["num_trials"]) == (1e-5, 0.1, 5)
+    assert 0.3 < results[0] < 2
 
 
 def test_the_example_of_a_bonus_takes_the_place_of_the_window(folder, tmp_path):
