@@ -4,6 +4,7 @@
     env = envs.make("pushbox", render_mode="ansi")       # a PettingZoo ParallelEnv
     rollout = envs.Rollout(world, num_trials=20)         # whole episodes, compiled
     print(envs.optimum("findtreasure"))                  # the exact optimum, by search
+    envs.optimal_plan(world)                             # how to play it: the joint actions, step by step
     envs.draw(world, world.start)                        # a picture; envs.save_gif makes a film of several
     env = gymnasium.make_vec("CoopGrid/PushBox-v0", num_envs=20)    # as envs.make_vec("pushbox", num_envs=20)
 
@@ -29,7 +30,7 @@ from envs.drawing import draw, save_gif
 from envs.files import complete_file
 from envs.parallel import GridParallelEnv
 from envs.rollout import Rollout, distinct_rows, epsilon_greedy, in_every_step, softmax
-from envs.search import Optimum, find_optimum
+from envs.search import Optimum, find_optimum, optimal_plan
 from envs.statistics import EpisodeLog, reward_per_step
 from envs.vector import GridVectorEnv
 from envs.worlds import WORLDS, make_world, parse_options

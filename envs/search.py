@@ -1,7 +1,8 @@
 """The exact optimum of a world, found in its compiled rules: every state it can reach, then dynamic programming over time.
 
 Nothing here knows a world's numbers; what is found is what `world.step` says. The value of a state at time t is the largest
-return with which it can be reached in exactly t steps; the steps that end the episode give the best by outcome and length.
+return with which it can be reached in exactly t steps; the steps that end the episode give the best by outcome and length. How
+to play such an episode is found backwards: the value of a state is then the largest return that can still be had from it.
 """
 
 import sys
@@ -20,6 +21,7 @@ from envs.statistics import reward_per_step
 MAX_STATES = 3_000_000
 AT_ONCE = 10**8  # states times actions times steps between two looks of the bar and of Ctrl-C: under a second
 PATIENCE = 2  # seconds without a bar
+CHOICES = 25_000_000  # actions of states that a backward pass keeps at a time: 100 MB
 ROUNDING = 1e-9  # returns that differ by less are the same sum, added up in another order
 
 
@@ -65,14 +67,9 @@ def find_optimum(world: World) -> Optimum:
     """
     table = 8 * (world.max_steps + 1) * max(len(world.outcome_names) + 1, world.num_agents)
     check_memory(f"a table of {world.max_steps} steps", 3 * table)
-    check_memory(f"all joint actions of {world.num_agents} agents", 100 * world.num_actions**world.num_agents)
     if not world.searchable:
         return played_plan(world)
-    joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
-    following, reward = compile_explore(world.step)(world.rules, world.start, joint, MAX_STATES)
-    if len(following) > MAX_STATES:
-        raise UsageError(f"only worlds of at most {MAX_STATES} states can be searched, and this {world.name} has more.")
-
+    _, following, reward = explored(world)
     returns = best_returns(following, reward, len(world.outcome_names), world.max_steps)
     per_step = reward_per_step(returns, np.arange(world.max_steps + 1)[:, None])
     names = ("time limit", *world.outcome_names)
@@ -94,6 +91,40 @@ def played_plan(world: World) -> Optimum:
     total = sum(world.step(world.rules, state, actions)[0] for actions in progress(plan, unit="step"))
     episode = Episode("time limit", len(plan), total, float(reward_per_step(total, len(plan))))
     return Optimum({}, episode, episode, None)
+
+
+def optimal_plan(world: World, episode: Episode | None = None):
+    """How to play an episode of `world`'s optimum: the joint actions, whole numbers [steps, num_agents].
+
+    episode: one of `Optimum`'s, by default `best_per_step`. Any outcome and number of steps will do: the plan has the largest
+    return of all such episodes; UsageError if there is none. A world that is not searchable gives its own `plan`.
+    """
+    if not world.searchable:
+        return world.plan()
+    episode = episode or find_optimum(world).best_per_step
+    joint, following, reward = explored(world)
+    names = ("time limit", *world.outcome_names)
+    plan = best_plan(following, reward, names.index(episode.outcome), episode.steps) if fits(world, episode) else None
+    if plan is None:
+        raise UsageError(f"{world.name} has no episode of {episode.steps} steps that ends by {episode.outcome!r}.")
+    return joint[plan]
+
+
+def fits(world, episode):
+    """Whether an episode may end so after so many steps, as far as names and the time limit say."""
+    if episode.outcome == "time limit":
+        return episode.steps == world.max_steps
+    return episode.outcome in world.outcome_names and 1 <= episode.steps <= world.max_steps
+
+
+def explored(world):
+    """All joint actions [J, num_agents], and what `explore` finds with them; UsageError if there are more than MAX_STATES."""
+    check_memory(f"all joint actions of {world.num_agents} agents", 100 * world.num_actions**world.num_agents)
+    joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
+    following, reward = compile_explore(world.step)(world.rules, world.start, joint, MAX_STATES)
+    if len(following) > MAX_STATES:
+        raise UsageError(f"only worlds of at most {MAX_STATES} states can be searched, and this {world.name} has more.")
+    return joint, following, reward
 
 
 @njit(cache=True)
@@ -197,3 +228,45 @@ def _further_steps(following, reward, value, returns, first, last):
             value += gain * (max_steps - t)
             return True
     return False
+
+
+def best_plan(following, reward, outcome, steps):
+    """The joint actions, by their numbers [steps], of the episode with this outcome and length that has the largest return.
+
+    None if there is no such episode. Of equally good actions it takes the first. A long episode is planned in parts, each by a
+    backward pass from the end, so that the actions of all states at all times need never be kept together.
+    """
+    plan, s = [], 0
+    part = max(1, CHOICES // len(following))
+    while len(plan) < steps:
+        for choice in _best_choices(following, reward, outcome, steps - len(plan), part):
+            if choice[s] < 0:
+                return None
+            plan.append(choice[s])
+            s = following[s, choice[s]]
+    return np.array(plan)
+
+
+@njit(cache=True)
+def _best_choices(following, reward, outcome, steps, part):
+    """The best joint action in every state, [part, S], at the first `part` of `steps` steps; -1 if none leads to `outcome`."""
+    num_states, num_joint = following.shape
+    choices = np.full((min(part, steps), num_states), -1, np.int32)
+    value = np.full(num_states, 0.0 if outcome == 0 else -np.inf)  # largest return of the steps from t + 1 on
+    for t in range(steps - 1, -1, -1):
+        earlier = np.full(num_states, -np.inf)
+        for s in range(num_states):
+            for j in range(num_joint):
+                target = following[s, j]
+                if target >= 0:
+                    total = reward[s, j] + value[target]
+                elif t == steps - 1 and target == -outcome:
+                    total = reward[s, j]
+                else:
+                    continue
+                if total > earlier[s]:
+                    earlier[s] = total
+                    if t < part:
+                        choices[t, s] = j
+        value = earlier
+    return choices

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
-from envs.search import best_returns
-from tests.helpers import assert_refused
+from envs.search import Episode, best_plan, best_returns
+from tests.helpers import RACE, assert_refused
 
 
 def summary(optimum):
@@ -102,6 +102,92 @@ def test_best_returns_are_those_of_all_plans(data):
 def test_the_best_return_and_the_best_return_per_step_may_be_of_different_episodes():
     returns = best_returns(np.array([[-1, 0]], np.int32), np.array([[2.0, 1.5]]), 1, 4)
     assert returns.tolist() == [[-np.inf, -np.inf], [-np.inf, 2], [-np.inf, 3.5], [-np.inf, 5], [6, 6.5]]
+
+
+# --- how to play the optimum ---
+
+
+def replayed(world, plan):
+    """The outcome, steps and return of a plan by the world's rules; no step may follow the end."""
+    state, total, outcome = world.start.copy(), 0.0, 0
+    for t, actions in enumerate(plan):
+        assert outcome == 0, f"the episode ends before step {t}"
+        reward, outcome = world.step(world.rules, state, actions)
+        total += reward
+    return ("time limit", *world.outcome_names)[outcome], len(plan), pytest.approx(total)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("cleaner", {}),
+        ("cleaner", {"size": 9, "num_agents": 3, "max_steps": 30}),
+        ("findtreasure", {}),
+        ("findtreasure", {"size": 9}),
+        ("findtreasure", {"max_steps": 7}),
+        ("findtreasure", {"max_steps": 3}),
+        ("gotogether", {}),
+        ("gotogether", {"size": 6}),
+        ("gotogether", {"max_steps": 22}),
+        ("movebox", {}),
+        ("movebox", {"max_steps": 24}),
+        ("pushbox", {}),
+        ("pushbox", {"step_penalty": 0.1, "boundary_penalty": 5.0}),
+        ("pushbox", {"step_penalty": 60.0, "max_steps": 2}),
+        ("pushbox", {"size": 6, "lone_push_penalty": 0.0}),
+        (str(RACE), {}),
+    ],
+)
+def test_every_episode_of_an_optimum_can_be_played(name, options):
+    world = envs.make_world(name, **options)
+    optimum = envs.optimum(name, **options)
+    for episode in (optimum.best_per_step, optimum.best_return, *optimum.fewest.values()):
+        plan = envs.optimal_plan(world, episode)
+        assert plan.shape == (episode.steps, world.num_agents)
+        assert replayed(world, plan) == episode[:3]
+    assert envs.optimal_plan(world).tolist() == envs.optimal_plan(world, optimum.best_per_step).tolist()
+
+
+@given(st.data())
+def test_best_plans_have_the_best_returns(data):
+    """In made-up worlds of three states, two actions and two outcomes, for every length and outcome that is possible or not."""
+    following = np.array(data.draw(st.lists(st.tuples(*[st.integers(-2, 2)] * 2), min_size=3, max_size=3)), np.int32)
+    reward = np.array(data.draw(st.lists(st.tuples(*[st.integers(-3, 3)] * 2), min_size=3, max_size=3)), float)
+    returns = best_returns(following, reward, 2, 8)
+    for steps, outcome in [*product(range(1, 9), (1, 2)), (8, 0)]:
+        plan = best_plan(following, reward, outcome, steps)
+        if plan is None:
+            assert returns[steps, outcome] == -np.inf
+            continue
+        state, total = 0, 0.0
+        for action in plan:
+            assert state >= 0
+            total, state = total + reward[state, action], following[state, action]
+        assert (len(plan), max(-state, 0), total) == (steps, outcome, returns[steps, outcome])
+
+
+def test_a_plan_in_parts_is_the_same_plan(monkeypatch):
+    world = envs.make_world("findtreasure")
+    whole = envs.optimal_plan(world)
+    for kept in (1, 3 * 328):  # one step at a time; three, three and two
+        monkeypatch.setattr("envs.search.CHOICES", kept)
+        assert envs.optimal_plan(world).tolist() == whole.tolist()
+
+
+@pytest.mark.parametrize(
+    ("outcome", "steps"), [("treasure", 7), ("meeting", 201), ("meeting", 0), ("goal", 8), ("time limit", 8)]
+)
+def test_an_episode_that_cannot_be_is_refused(outcome, steps):
+    episode = Episode(outcome, steps, 0.0, 0.0)
+    assert_refused(f"no episode of {steps} steps", envs.optimal_plan, envs.make_world("findtreasure"), episode)
+
+
+# --- limits ---
+
+
+def test_more_joint_actions_than_memory_concern_only_worlds_that_are_searched():
+    world = envs.make_world("cleaner", num_agents=40, max_steps=3)
+    assert replayed(world, envs.optimal_plan(world)) == envs.optimum("cleaner", num_agents=40, max_steps=3).best_return[:3]
 
 
 def test_worlds_with_too_many_states_are_refused(monkeypatch):
