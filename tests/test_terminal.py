@@ -2,6 +2,7 @@
 
 import io
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,7 +104,29 @@ def test_the_picture_of_all_worlds(monkeypatch, tmp_path):
     assert np.all(page[:, 425:455] == 255)  # space between two maps
 
 
-def test_a_picture_that_cannot_be_written(monkeypatch, tmp_path, capsys):
+def test_the_films_of_optimal_play(monkeypatch, tmp_path):
+    """As many pictures as the optimum has steps and one of the start (in cleaner until all is clean), and those in docs/."""
+    assert run(gallery, monkeypatch, "--plays", str(tmp_path / "films")) == 0
+    steps = {"cleaner": 61, "findtreasure": 8, "gotogether": 23, "movebox": 25, "pushbox": 4}
+    assert sorted(path.name for path in (tmp_path / "films").iterdir()) == [f"optimal-{name}.gif" for name in steps]
+    for name, number in steps.items():
+        path = tmp_path / "films" / f"optimal-{name}.gif"
+        assert path.stat().st_size < 100_000
+        with Image.open(path) as film, Image.open(Path(envs.__file__).parents[1] / "docs" / path.name) as published:
+            assert film.n_frames == published.n_frames == number + 1
+            for k in (0, number // 2, number):
+                film.seek(k)
+                published.seek(k)
+                assert np.array_equal(np.asarray(film.convert("RGB")), np.asarray(published.convert("RGB"))), (name, k)
+
+
+@pytest.mark.parametrize("words", [["worlds.png"], ["--plays", "films"]])
+def test_a_picture_that_cannot_be_written(words, monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    assert run(gallery, monkeypatch, str(tmp_path / "file" / "worlds.png")) == 2
+    assert run(gallery, monkeypatch, *words[:-1], str(tmp_path / "file" / words[-1])) == 2
     assert "cannot write" in capsys.readouterr().err
+
+
+def test_a_gallery_of_nothing_is_refused(monkeypatch, capsys):
+    assert run(gallery, monkeypatch) == 2
+    assert "a folder after --plays" in capsys.readouterr().err
