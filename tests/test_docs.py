@@ -1,12 +1,14 @@
-"""The pages of docs/ keep pace with the scripts: options, curves, equations' places, excerpts and links."""
+"""The pages of docs/ keep pace with scripts and worlds: options, curves, equations' places, excerpts, optima and links."""
 
 import ast
 import importlib
+import inspect
 import json
 import os
 import re
 import subprocess
 import sys
+import textwrap
 from dataclasses import fields
 from pathlib import Path
 
@@ -18,6 +20,7 @@ from envs.run import RunArgs
 ROOT = Path(envs.__file__).parents[1]
 METHODS = ROOT / "docs" / "methods"
 SCRIPTS = sorted(path.stem for path in (ROOT / "algos").glob("*.py"))
+WORLDS = list(envs.WORLDS)
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PARTS = [
     "Equations",
@@ -27,11 +30,16 @@ PARTS = [
     "What was found here",
     "Known deviations",
 ]
+WORLD_PARTS = ["Map", "Rules", "Options", "Exact optimum", "What is hard about it", "Source and differences"]
 
 
 def part(page, heading):
     """The text under a heading of the second level, up to the next."""
     return re.search(rf"^## {heading}\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL).group(1)
+
+
+def world_page(name):
+    return (ROOT / "docs" / "worlds" / f"{name}.md").read_text(encoding="utf-8")
 
 
 def options(text):
@@ -117,6 +125,67 @@ def test_relative_links_lead_to_files():
         links = re.findall(r"\]\((?!https?:|#)([^)#\s]+)", words)
         missing |= {path for link in links if not (path := (text.parent / link).resolve()).exists()}
     assert not missing
+
+
+# --- the worlds ---
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_world_has_a_page_in_the_common_shape(name):
+    page = world_page(name)
+    opening = rf"# (\w+)\n\n!\[optimal play of {name}\]\(\.\./optimal-{name}\.gif\)\n\n(.*?)\n\n## "
+    title, about = re.match(opening, page, re.DOTALL).groups()
+    assert title == envs.WORLDS[name].__name__
+    assert len(re.findall(r"\.(?=\s|$)", about)) == 3  # sentences
+    words = re.sub(r"^```.*?^```", "", page, flags=re.MULTILINE | re.DOTALL)  # walls look like headings
+    assert re.findall(r"^##? (.+)$", words, re.MULTILINE)[1:] == WORLD_PARTS
+    assert re.findall(r"^- \*\*(\w+)\.\*\*", part(page, "Rules"), re.MULTILINE) == ["Actions", "Observation", "Rewards", "Ends"]
+    index = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    assert re.search(rf"^\| \[`{name}`\]\(worlds/{name}\.md\) \|", index, re.MULTILINE)
+
+
+def test_there_is_no_page_without_a_world():
+    assert sorted(path.stem for path in (ROOT / "docs" / "worlds").glob("*.md")) == sorted(WORLDS)
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_worlds_map_and_actions_are_those_of_its_file(name):
+    page, world = world_page(name), envs.WORLDS[name]
+    (drawn,) = re.findall(r"```\n(.*?)```", part(page, "Map"), re.DOTALL)
+    assert textwrap.indent(drawn, "    ") in sys.modules[world.__module__].__doc__
+    actions = ", ".join(f"{k} {action}" for k, action in enumerate(world.action_names))
+    assert f"- **Actions.** {actions}." in part(page, "Rules")
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_page_has_every_option_of_its_world_with_its_default(name):
+    told = re.findall(r"^\| `(\w+)` \| (.*?) \| \S", part(world_page(name), "Options"), re.MULTILINE)
+    defaults = [(option, each.default) for option, each in inspect.signature(envs.WORLDS[name]).parameters.items()]
+    assert told == [(option, f"{value:g}" if isinstance(value, float) else str(value)) for option, value in defaults]
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_the_optimum_on_a_worlds_page_is_what_the_search_gives(name):
+    told = part(world_page(name), "Exact optimum")
+    assert re.findall(r"```\n(.*?)\n```", told, re.DOTALL) == [str(envs.optimum(name))]
+    assert f"python -c \"import envs; print(envs.optimum('{name}'))\"" in told
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_random_play_is_as_the_pages_say(name, capsys):
+    """The program in docs/worlds.md, which takes a second or two, with this world in the place of pushbox."""
+    index = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(import numpy as np, envs\n.*?)```", index, re.DOTALL)
+    exec(program.replace("pushbox", name), {})
+    per_step, mean, *ends = map(float, re.findall(r"-?\d+\.?\d*(?:e-\d+)?", capsys.readouterr().out))
+    assert re.search(rf"^\| \[`{name}`\].* \| {per_step:.3f} \|$", index, re.MULTILINE)
+    (told,) = re.findall(r"- \*\*Random play\*\* ((?:.+\n)+)", part(world_page(name), "What is hard about it"))
+    numbers = re.findall(r"-?\d+(?:\.\d+)?", told.replace("10 000", ""))
+    if name == "cleaner":
+        assert numbers == [f"{mean:.1f}", "71"]
+    else:
+        counts = [f"{count:g}" for count in ends if count]
+        assert sorted(numbers) == sorted(counts + ([f"{mean:.0f}"] if name == "gotogether" else []))
 
 
 # --- the notebook ---
