@@ -127,6 +127,13 @@ def test_relative_links_lead_to_files():
     assert not missing
 
 
+def test_the_site_leads_to_every_page():
+    """Told from mkdocs.yml as text: the tests need no mkdocs. README.md is its first page, as index.md."""
+    listed = re.findall(r"^ +- (?:[^:\n]+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    pages = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted(["index.md", *pages])
+
+
 # --- the worlds ---
 
 
