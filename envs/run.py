@@ -490,4 +490,8 @@ def main(args_class, build, train):
     script = sys.modules[args_class.__module__]
     with command_line(Path(script.__file__).name):
         args = tyro.cli(args_class, description=script.__doc__)
-        evaluate(args, script) if args.evaluate else train(args)
+        try:
+            evaluate(args, script) if args.evaluate else train(args)
+        except torch.linalg.LinAlgError as error:  # a matrix that is no longer one, as that of EMI's embeddings
+            reason = "a learnt model's numbers are no longer finite; a step size or a weight is too large"
+            raise envs.UsageError(f"{reason} ({one_line(error)}).") from error

@@ -521,6 +521,12 @@ def test_numbers_that_are_no_longer_finite_end_the_run_with_the_episode(tmp_path
     assert not (tmp_path / "episodes.npz").exists()
 
 
+def test_a_learnt_model_that_is_no_longer_finite_ends_the_run(tmp_path):
+    words = ["--embedding-learning-rate", "1e38", "--embedding-batch", 2, "--num-episodes", 50, "--max-steps", 5]
+    ended = command("espg_emi", *words, "--run-dir", tmp_path / "run")
+    assert_refusal("espg_emi", ended, "a learnt model's numbers are no longer finite")
+
+
 def test_a_full_standard_output_gives_one_sentence_and_keeps_the_results(tmp_path):
     words = [sys.executable, ALGOS / "pg.py", "--num-episodes", "2", "--run-dir", tmp_path / "run"]
     with open("/dev/full", "w") as full:
