@@ -8,7 +8,7 @@ import numpy as np
 import envs
 from benchmark import measures
 from benchmark.cells import OPTIMIZERS, WORLDS, name_of
-from benchmark.results import BLOCK, named_in
+from benchmark.results import block_of, named_in
 from envs.drawing import AGENTS
 
 matplotlib.use("Agg")
@@ -82,7 +82,7 @@ def line(axis, method, xs, values, error=None):
 
 def episodes_of(result):
     """The number of the last episode of each block."""
-    return (np.arange(result.score.shape[1]) + 1) * BLOCK
+    return (np.arange(result.score.shape[1]) + 1) * block_of(result.num_episodes)
 
 
 def optimum_line(axis, world):
@@ -98,7 +98,7 @@ def learning_curves(results, methods):
         optimum_line(axis, world)
         line(axis, method, episodes_of(result), *measures.mean_and_error(result.score))
 
-    return panels(results, methods, f"reward per step (mean of {BLOCK} episodes)", draw)
+    return panels(results, methods, "reward per step (mean of a block of episodes)", draw)
 
 
 def curves_over_steps(results, methods):
@@ -115,7 +115,7 @@ def curves_over_steps(results, methods):
 
 
 def share_at_best(results, methods):
-    """The share of the trials that end most of 100 episodes in the best outcome."""
+    """The share of the trials that end most episodes of a block in the best outcome."""
 
     def draw(axis, world, method, result):
         line(axis, method, episodes_of(result), measures.at_best_outcome(result).mean(0))

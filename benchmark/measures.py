@@ -8,7 +8,7 @@ from rliable import library, metrics
 
 import envs
 from benchmark.cells import METHODS
-from benchmark.results import BLOCK
+from benchmark.results import block_of
 
 
 @cache
@@ -41,7 +41,11 @@ def reached(result, good, share=0.95):
     good: whether a trial was, in each block of episodes, [num_trials, blocks]. None if that never was so.
     """
     blocks = np.flatnonzero(good.mean(0) >= share)
-    return ((int(blocks[0]) + 1) * BLOCK, float(result.steps[:, blocks[0]].mean())) if len(blocks) else None
+    return (
+        ((int(blocks[0]) + 1) * block_of(result.num_episodes), float(result.steps[:, blocks[0]].mean()))
+        if len(blocks)
+        else None
+    )
 
 
 def near_optimum(result, world, margin=0.05):

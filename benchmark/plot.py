@@ -27,6 +27,7 @@ from matplotlib import pyplot as plt
 
 POINTS = 100  # of the longest curve in a panel
 RESAMPLES = 2000  # of the bootstrap
+FEWEST = 5  # trials that have an interval
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ def read(directories):
         first = settings.pop("seed")
         settings.pop("num_trials")
         trials = found.setdefault(json.dumps(settings), {})
+        if again := sorted(set(trials) & {first + k for k in range(len(scores))}):
+            print(f"{directory} holds seed {again[0]} once more; its trials replace the earlier ones.", file=sys.stderr)
         trials.update({first + k: score for k, score in enumerate(scores)})
     return found
 
@@ -136,12 +139,15 @@ def tables(groups):
     scores, differences = [["world", "curve", "trials", "episodes", "reward per step", "95 % interval", "worst trial"]], []
     for group in groups:
         low, high = bootstrap(group.last, np.random.default_rng(0))
-        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", f"[{low:.2f}, {high:.2f}]"]
+        interval = f"[{low:.2f}, {high:.2f}]" if len(group.seeds) >= FEWEST else "-"
+        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", interval]
         scores.append([group.world, group.label, *words, f"{group.last.min():.2f}"])
     firsts = {group.world: group for group in reversed(groups)}
     for group in (group for group in groups if group is not firsts[group.world]):
         (difference, *bounds), (better, *shares) = compare(group, firsts[group.world])
-        words = ["{:+.2f} [{:+.2f}, {:+.2f}]".format(difference, *bounds), "{:.2f} [{:.2f}, {:.2f}]".format(better, *shares)]
+        words = [f"{difference:+.2f}", f"{better:.2f}"]
+        if min(len(group.seeds), len(firsts[group.world].seeds)) >= FEWEST:
+            words = [f"{words[0]} [{bounds[0]:+.2f}, {bounds[1]:+.2f}]", f"{words[1]} [{shares[0]:.2f}, {shares[1]:.2f}]"]
         differences.append([group.world, f"{group.label} - {firsts[group.world].label}", *words])
     return scores, [["world", "curves", "difference", "probability of improvement"], *differences]
 

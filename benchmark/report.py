@@ -183,7 +183,7 @@ def all_figures(found):
             drawn[name] = figures.learning_curves(found, methods)
             drawn[f"{name}-steps"] = figures.curves_over_steps(found, methods)
             drawn[f"{name}-best"] = figures.share_at_best(found, methods)
-    if any(len(result.actions) for result in found.values()):
+    if any(all((r := found.get((world, m, "sign"))) and len(r.actions) for m in ("pg", "decespg")) for world in WORLDS):
         drawn["figure5"] = figures.trajectories(found)
     if worlds := worlds_of_all(found):
         scores = {optimizer: measures.scores_over_worlds(found, optimizer, worlds) for optimizer in OPTIMIZERS}

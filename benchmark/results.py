@@ -15,14 +15,19 @@ from envs import run
 from envs.command import one_line
 
 STORE = ROOT / "benchmark" / "results"
-BLOCK = 100  # episodes of which a point of a curve is the mean
+BLOCK = 100  # episodes of which a point of a curve is the mean, at most
+
+
+def block_of(num_episodes):
+    """Episodes of which a point of a curve is the mean: fewer than BLOCK in short runs, which have 20 points."""
+    return min(BLOCK, max(1, num_episodes // 20))
 
 
 @dataclass(frozen=True)
 class Result:
     """What is kept of the trials of a method in a world."""
 
-    score: np.ndarray  # [num_trials, num_episodes / BLOCK] reward per step, mean of each block
+    score: np.ndarray  # [num_trials, blocks] reward per step, mean of each block (`block_of`)
     at_best: np.ndarray  # shaped as score, share of the episodes that ended in the best outcome
     steps: np.ndarray  # shaped as score, environment steps from the first episode to the end of each block
     last: np.ndarray  # [num_trials] reward per step, mean of the last 5 % of the episodes
@@ -48,10 +53,11 @@ class Result:
         log = envs.EpisodeLog(world, *returns.shape)
         log.returns, log.lengths, log.outcomes = returns, lengths, outcomes
         trials, num_episodes = returns.shape
-        blocks, recent = num_episodes // BLOCK, slice(-max(1, num_episodes // 20), None)
+        block = block_of(num_episodes)
+        blocks, recent = num_episodes // block, slice(-max(1, num_episodes // 20), None)
 
         def in_blocks(values):
-            return values[:, : blocks * BLOCK].reshape(trials, blocks, BLOCK)
+            return values[:, : blocks * block].reshape(trials, blocks, block)
 
         commits = sorted({about.get("commit", "") for about in abouts})
         return cls(
@@ -142,14 +148,12 @@ def finished(runs, seeds=(1, 20), num_episodes=None, scripts=()):
 
 def cover(parts, first, end):
     """Those of {(first seed, the seed after the last): directory} that follow each other from `first` to `end`, or nothing."""
-    chosen = []
-    while first != end:
-        block = max((block for block in parts if block[0] == first and block[1] <= end), default=None)
-        if block is None:
-            return []
-        chosen.append(parts[block])
-        first = block[1]
-    return chosen
+    for block in sorted(parts, reverse=True):  # the longest first
+        if block[0] == first and block[1] <= end:
+            rest = cover(parts, block[1], end)
+            if rest or block[1] == end:
+                return [parts[block], *rest]
+    return []
 
 
 def keep(found):

@@ -44,15 +44,16 @@ def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     result = Result.of_runs([folder])
     score = returns / np.maximum(lengths - 1, 1)
     best = envs.make_world("pushbox").best_outcome
-    assert result.score.shape == result.at_best.shape == (20, 2)
-    assert result.score[3, 1] == pytest.approx(score[3, 100:200].mean(), abs=1e-6)
-    assert result.at_best[4, 0] == pytest.approx((outcomes[4, :100] == best).mean(), abs=1e-6)
+    assert result.score.shape == result.at_best.shape == (20, 20)  # blocks of 12
+    assert result.score[3, 1] == pytest.approx(score[3, 12:24].mean(), abs=1e-6)
+    assert result.at_best[4, 0] == pytest.approx((outcomes[4, :12] == best).mean(), abs=1e-6)
     assert result.last == pytest.approx(score[:, -12:].mean(1))
     assert result.usual[5] == np.bincount(outcomes[5, -12:]).argmax()
     assert (result.num_episodes, result.seconds) == (250, 12.5)
     assert result.about["args"]["learning_rate"] == Cell("pg", "pushbox", "adam").settings["learning_rate"]
     assert "run_dir" not in result.about["args"]
-    assert result.steps[7].tolist() == [lengths[7, :100].sum(), lengths[7, :200].sum()]
+    assert result.steps[7, [0, 19]].tolist() == [lengths[7, :12].sum(), lengths[7, :240].sum()]
+    assert [results.block_of(n) for n in (1, 50, 2000, 20_000)] == [1, 2, 100, 100]
 
 
 def test_a_result_is_loaded_as_it_was_saved(tmp_path):
@@ -97,6 +98,7 @@ def test_blocks_that_overlap_or_leave_a_gap_are_none():
     assert cover((1, 11), (11, 21)) == ["(1, 11)", "(11, 21)"]
     assert cover((1, 21), (1, 11), (11, 21), (5, 8)) == ["(1, 21)"]
     assert cover((1, 11), (12, 21)) == cover((1, 11), (10, 21)) == cover((1, 22)) == cover((2, 21)) == []
+    assert cover((1, 11), (1, 16), (11, 21)) == ["(1, 11)", "(11, 21)"]
 
 
 def test_what_is_broken_is_named_and_left_out(tmp_path, store, capsys):
@@ -166,7 +168,7 @@ def test_a_difference_is_that_of_the_same_seeds():
 def test_when_most_trials_are_good_is_the_end_of_the_first_such_block():
     good = np.zeros((20, 4), bool)
     good[:18, 1], good[:19, 2], good[:, 3] = True, True, True
-    result = some_result(np.zeros(20), steps=np.arange(80).reshape(20, 4))
+    result = some_result(np.zeros(20), num_episodes=20_000, steps=np.arange(80).reshape(20, 4))
     assert measures.reached(result, good) == (300, result.steps[:, 2].mean())
     assert measures.reached(result, good[:, :2]) is None
     score = np.array([[0.949, 0.951], [0.96, 0.94]]) * 100 / 3
