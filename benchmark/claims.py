@@ -414,17 +414,12 @@ def memory_alone(found):
     return figures | dict(epg_t=treasure.at_best("epg"), epg_p=push.at_best("epg"))
 
 
-def two_differences(one, other):
-    """{world_optimiser: "mean [low, high]"} of one method minus another in FindTreasure and PushBox, and their verdicts."""
-
-    def figures(found):
-        pairs = {
-            f"{c.world}_{c.optimizer}": c.minus(one, other) for w in ("findtreasure", "pushbox") for c in cells_of(found, w)
-        }
-        verdicts = {f"{key}_verdict": verdict for key, (_, verdict) in pairs.items()}
-        return {key: words.partition(" = ")[2] for key, (words, _) in pairs.items()} | verdicts
-
-    return figures
+def what_the_bonus_adds(found):
+    """{world_optimiser: "mean [low, high]"} of DecESPG minus SPG, and the verdicts on them."""
+    places = [*product(("findtreasure", "pushbox"), OPTIMIZERS), ("movebox", "sign")]
+    pairs = {f"{world}_{optimizer}": Cells(found, world, optimizer).minus("decespg", "spg") for world, optimizer in places}
+    verdicts = {f"{key}_verdict": verdict for key, (_, verdict) in pairs.items()}
+    return {key: words.partition(" = ")[2] for key, (words, _) in pairs.items()} | verdicts
 
 
 def verdicts_of(figures):
@@ -479,10 +474,11 @@ SENTENCES = (
         lambda f: min(f["spg_t"], f["spg_p"]) >= 19 and max(f["epg_t"], f["epg_p"]) <= 1,
     ),
     Sentence(
-        "What the bonus adds to it cannot be told from nothing here: DecESPG minus SPG is {findtreasure_sign} (FindTreasure) "
-        "and {pushbox_sign} (PushBox) under sign descent, {findtreasure_adam} and {pushbox_adam} under Adam.",
-        two_differences("decespg", "spg"),
-        lambda f: set(verdicts_of(f)) == {UNDECIDED},
+        "What the bonus adds to the memory, DecESPG minus SPG, cannot be told from nothing in FindTreasure, "
+        "{findtreasure_sign} (sign) and {findtreasure_adam} (Adam), and PushBox, {pushbox_sign} and {pushbox_adam}; in MoveBox "
+        "(sign) it is {movebox_sign}.",
+        what_the_bonus_adds,
+        lambda f: f.pop("movebox_sign_verdict") == YES and set(verdicts_of(f)) == {UNDECIDED},
     ),
     Sentence(
         "Learnt novelty does as well in FindTreasure; in PushBox the large box is kept with EX2 in {decespg_ex2_sign} (sign) "
