@@ -13,12 +13,12 @@ value of o_j to agent j, and because the paper says of EDTI only that its agents
 not say on which learner EDTI ran.
 
 rhat is that of the published code (TonghanWang/EITI-EDTI, Curiosity.py and ppo2/runner.py: count-based probabilities and the
-option --r_tv, which README.md says is EDTI). The weights are those of README.txt for its task Pass, the only ones published,
-though it runs --tv, which has no shares. Without shares, with these and with share_int 1 five teams end in findtreasure at 5.4,
-6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3 (adam), each +- 1 to 2. That of r only makes it count more, because r is the team's. The
-reward of Pass is 1000 and u adds to r, so eta is scaled by the world's largest reward / 1000. The other weights are not: they
-and c have no unit, and V^ext and V^int have that of r and u. Unlike there, nothing follows the step that terminates an episode,
-and PPO gives way to ac.py's update.
+option --r_tv, which README.md says is EDTI). The weights are those of README.txt's command for the task Pass, the only ones
+published; it names the shares, too, though it runs --tv, which leaves them out. Without shares, with these and with share_int 1
+five teams end in findtreasure at 5.4, 6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3 (adam), each +- 1 to 2. That of r only makes it
+count more, because r is the team's. The reward of Pass is 1000 and u adds to r, so eta is scaled by the world's largest reward
+/ 1000. The other weights are not: they and c have no unit, and V^ext and V^int have that of r and u. Unlike there, nothing
+follows the step that terminates an episode, and PPO gives way to ac.py's update.
 
     python algos/edti.py --env pushbox --num-trials 20
 """

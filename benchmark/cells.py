@@ -9,6 +9,7 @@ import json
 import os
 import re
 import sys
+import tempfile
 from dataclasses import dataclass, fields
 from functools import cache, cached_property
 from pathlib import Path
@@ -71,6 +72,12 @@ def script(method):
         if not hasattr(module, name):
             raise envs.UsageError(f"{path} is no script for the comparison, because it has no {name}.")
     return module
+
+
+def train_aside(module, **args):
+    """Train in a directory that goes afterwards, without a word on stdout; returns what the script's `train` returns."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        return module.train(module.Args(run_dir=Path(folder) / "run", **args))
 
 
 def has_policies(method):

@@ -125,10 +125,9 @@ def ours_find_the_optimum(cells):
 
 
 def ours_reach_the_far_goal(cells):
-    counts = [cells.at_best(method) for method in OURS]
-    return f"{cells.trials(OURS)}; {cells.means(OURS)} of {cells.optimum:.2f}", YES if min(counts) >= 19 else PARTLY if min(
-        counts
-    ) else NO
+    words = f"{cells.trials(OURS)}; {cells.means(OURS)} of {cells.optimum:.2f}"
+    fewest = min(cells.at_best(method) for method in OURS)
+    return words, YES if fewest >= 19 else PARTLY if fewest else NO
 
 
 def ours_push_the_large_box(cells):
@@ -156,8 +155,7 @@ def memory_helps(cells):
 
 
 def bonus_hurts(cells):
-    words, verdict = cells.minus("pg", "epg")
-    return words, verdict
+    return cells.minus("pg", "epg")
 
 
 def memory_is_essential(cells):
@@ -415,15 +413,11 @@ def memory_alone(found):
 
 
 def what_the_bonus_adds(found):
-    """{world_optimiser: "mean [low, high]"} of DecESPG minus SPG, and the verdicts on them."""
+    """{world_optimiser: "mean [low, high]"} of DecESPG minus SPG, and the verdicts on them in the same order."""
     places = [*product(("findtreasure", "pushbox"), OPTIMIZERS), ("movebox", "sign")]
     pairs = {f"{world}_{optimizer}": Cells(found, world, optimizer).minus("decespg", "spg") for world, optimizer in places}
-    verdicts = {f"{key}_verdict": verdict for key, (_, verdict) in pairs.items()}
-    return {key: words.partition(" = ")[2] for key, (words, _) in pairs.items()} | verdicts
-
-
-def verdicts_of(figures):
-    return [value for name, value in figures.items() if name.endswith("_verdict")]
+    verdicts = [verdict for _, verdict in pairs.values()]
+    return {key: words.partition(" = ")[2] for key, (words, _) in pairs.items()} | dict(verdicts=verdicts)
 
 
 def learnt_novelty(found):
@@ -478,7 +472,7 @@ SENTENCES = (
         "{findtreasure_sign} (sign) and {findtreasure_adam} (Adam), and PushBox, {pushbox_sign} and {pushbox_adam}; in MoveBox "
         "(sign) it is {movebox_sign}.",
         what_the_bonus_adds,
-        lambda f: f.pop("movebox_sign_verdict") == YES and set(verdicts_of(f)) == {UNDECIDED},
+        lambda f: f["verdicts"] == [*[UNDECIDED] * 4, YES],
     ),
     Sentence(
         "Learnt novelty does as well in FindTreasure; in PushBox the large box is kept with EX2 in {decespg_ex2_sign} (sign) "

@@ -7,13 +7,10 @@ each pair u. Only pairs that are visited at least `VISITS` times count, so that 
 model that has not begun to learn says nothing yet (EX2's waits for 1000 pairs); visits count from where it does.
 """
 
-import contextlib
-import dataclasses
-import io
 import sys
-import tempfile
 from collections import defaultdict
 from pathlib import Path
+from unittest.mock import patch
 
 import matplotlib
 import numpy as np
@@ -21,7 +18,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, ROOT, WORLDS, check_words, name_of, script
+from benchmark.cells import METHODS, ROOT, WORLDS, check_words, name_of, script, train_aside
 from benchmark.figures import DASHES, colour_of
 from benchmark.report import markdown
 from envs.command import command_line
@@ -44,9 +41,8 @@ def bonuses_of_visits(method, args):
     """Train; returns the bonus of the first VISITS visits to each pair that has as many, [pairs, VISITS]."""
     module, seen = script(method), defaultdict(list)
     name = novelty_class(module)
-    original = getattr(module, name)
 
-    class Watched(original):
+    class Watched(getattr(module, name)):
         def bonus(self, pairs, *rest):
             values, *figures = super().bonus(pairs, *rest)
             (lengths, *_) = rest
@@ -60,12 +56,8 @@ def bonuses_of_visits(method, args):
                             visits.append(value)
             return values, *figures
 
-    setattr(module, name, Watched)
-    try:
-        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-            module.train(dataclasses.replace(module.Args(), run_dir=Path(folder) / "run", **args))
-    finally:
-        setattr(module, name, original)
+    with patch.object(module, name, Watched):
+        train_aside(module, **args)
     return np.array([visits for visits in seen.values() if len(visits) == VISITS])
 
 

@@ -13,12 +13,9 @@ Prints processor seconds for an environment step and their ratios. They are thos
 on, without imports and compilation. Where trials follow each other, 20 of them cost what one does, step for step; three run.
 """
 
-import contextlib
 import importlib.util
-import io
 import os
 import sys
-import tempfile
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -31,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
 from algos import pg
+from benchmark.cells import train_aside
 from benchmark.speed import print_table
 from envs.command import command_line
 
@@ -40,12 +38,11 @@ ALONE = 3  # trials of those that run one after the other
 
 def run_pg(name, num_trials, num_episodes):
     """(returns [num_trials, num_episodes], number of steps, processor seconds) of algos/pg.py."""
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        args = dict(env=name, num_trials=num_trials, optimizer="adam")
-        pg.train(pg.Args(**args, num_episodes=2, run_dir=Path(folder) / "warm-up"))
-        start = time.process_time()
-        log = pg.train(pg.Args(**args, num_episodes=num_episodes, run_dir=Path(folder) / "run")).log
-        return log.returns, log.lengths.sum(), time.process_time() - start
+    args = dict(env=name, num_trials=num_trials, optimizer="adam")
+    train_aside(pg, num_episodes=2, **args)  # compiles
+    start = time.process_time()
+    log = train_aside(pg, num_episodes=num_episodes, **args).log
+    return log.returns, log.lengths.sum(), time.process_time() - start
 
 
 def to_go(rewards, gamma):

@@ -4,13 +4,15 @@
 
 Runs that differ in nothing but their seeds are one curve: the mean over their trials and a 95 % bootstrap interval. Prints the
 reward per step over the last 5 % of the episodes and, in each world, what every curve has more than the first: the difference
-(of trials of the same seeds, if both have the same) and the probability that a trial of it ends better than one of the first.
+over the trials of the same seeds, and the probability that a trial of it ends better than one of the first. Fewer than five
+trials have no interval.
 """
 
 import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated
 
 import matplotlib
@@ -19,8 +21,10 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
+from benchmark import measures
 from benchmark.cells import settings_of
 from benchmark.report import markdown
+from envs.command import command_line
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -73,40 +77,29 @@ def groups_of(found):
     for own, trials in zip(settings, found.values(), strict=True):
         others = [other for other in settings if (other["method"], other["env"]) == (own["method"], own["env"])]
         names = [name for name in own if any(other.get(name) != own[name] for other in others)]
-        words = [
-            f"{name}={' '.join(map(str, value)) if isinstance(value, list) else value}"
-            for name in names
-            for value in [own[name]]
-        ]
+        values = [" ".join(map(str, own[name])) if isinstance(own[name], list) else own[name] for name in names]
+        words = [f"{name}={value}" for name, value in zip(names, values, strict=True)]
         seeds = tuple(sorted(trials))
         score = np.stack([trials[seed] for seed in seeds])
         groups.append(Group(" ".join([own["method"], *words]), Path(own["env"]).stem, seeds, score))
     return groups
 
 
-def bootstrap(values, generator, statistic=lambda resampled: resampled.mean(1)):
-    """The 95 % interval of a statistic of trials [num_trials, ..]: (low, high)."""
-    draws = generator.integers(len(values), size=(RESAMPLES, len(values)))
-    return np.quantile(statistic(values[draws]), (0.025, 0.975), axis=0)
+def interval(values):
+    """The 95 % bootstrap interval of the mean of trials [num_trials, ..]: (low, high)."""
+    draws = np.random.default_rng(0).integers(len(values), size=(RESAMPLES, len(values)))
+    return np.quantile(values[draws].mean(1), (0.025, 0.975), axis=0)
 
 
 def compare(one, other):
-    """What `one` has more than `other`: (difference, low, high), (probability that a trial of `one` ends better, low, high)."""
-    generator = np.random.default_rng(0)
-    if one.seeds == other.seeds:
-        paired = one.last - other.last
-        difference = paired.mean(), *bootstrap(paired, generator)
-    else:
-        draws = [
-            values.last[generator.integers(len(values.last), size=(RESAMPLES, len(values.last)))] for values in (one, other)
-        ]
-        difference = one.last.mean() - other.last.mean(), *np.quantile(draws[0].mean(1) - draws[1].mean(1), (0.025, 0.975))
-
-    def better(some, others):
-        return ((some[..., :, None] > others[..., None, :]) + 0.5 * (some[..., :, None] == others[..., None, :])).mean((-1, -2))
-
-    draws = [values.last[generator.integers(len(values.last), size=(RESAMPLES, len(values.last)))] for values in (one, other)]
-    return difference, (better(one.last, other.last), *np.quantile(better(*draws), (0.025, 0.975)))
+    """What `one` has more than `other`, in words: over the trials of the same seeds, and the probability of improvement."""
+    seeds = sorted(set(one.seeds) & set(other.seeds))
+    same = [SimpleNamespace(last=group.last[np.isin(group.seeds, seeds)]) for group in (one, other)]
+    scores = {"one": one.last[:, None], "other": other.last[:, None]}
+    better, *shares = measures.improvements(scores, over="one")["other"]
+    words = "{:+.2f} [{:+.2f}, {:+.2f}]".format(*measures.difference(*same)) if len(seeds) >= FEWEST else "-"
+    enough = min(map(len, (one.seeds, other.seeds))) >= FEWEST
+    return [words, f"{better:.2f}" + (" [{:.2f}, {:.2f}]".format(*shares) if enough else "")]
 
 
 def draw(groups, path):
@@ -121,9 +114,7 @@ def draw(groups, path):
             blocks = group.score[:, : group.score.shape[1] // block * block].reshape(len(group.score), -1, block).mean(2)
             episodes = (np.arange(blocks.shape[1]) + 1) * block
             (curve,) = axis.plot(episodes, blocks.mean(0), color=f"C{labels.index(group.label) % 10}", label=group.label)
-            axis.fill_between(
-                episodes, *bootstrap(blocks, np.random.default_rng(0)), color=curve.get_color(), alpha=0.2, linewidth=0
-            )
+            axis.fill_between(episodes, *interval(blocks), color=curve.get_color(), alpha=0.2, linewidth=0)
         axis.set_title(world, fontsize="medium")
         axis.set_xlabel("episode")
     axes[0, 0].set_ylabel("reward per step")
@@ -138,17 +129,13 @@ def tables(groups):
     """The scores of all, and in each world the differences to the first."""
     scores, differences = [["world", "curve", "trials", "episodes", "reward per step", "95 % interval", "worst trial"]], []
     for group in groups:
-        low, high = bootstrap(group.last, np.random.default_rng(0))
-        interval = f"[{low:.2f}, {high:.2f}]" if len(group.seeds) >= FEWEST else "-"
-        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", interval]
+        bounds = "[{:.2f}, {:.2f}]".format(*interval(group.last)) if len(group.seeds) >= FEWEST else "-"
+        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", bounds]
         scores.append([group.world, group.label, *words, f"{group.last.min():.2f}"])
     firsts = {group.world: group for group in reversed(groups)}
     for group in (group for group in groups if group is not firsts[group.world]):
-        (difference, *bounds), (better, *shares) = compare(group, firsts[group.world])
-        words = [f"{difference:+.2f}", f"{better:.2f}"]
-        if min(len(group.seeds), len(firsts[group.world].seeds)) >= FEWEST:
-            words = [f"{words[0]} [{bounds[0]:+.2f}, {bounds[1]:+.2f}]", f"{words[1]} [{shares[0]:.2f}, {shares[1]:.2f}]"]
-        differences.append([group.world, f"{group.label} - {firsts[group.world].label}", *words])
+        first = firsts[group.world]
+        differences.append([group.world, f"{group.label} - {first.label}", *compare(group, first)])
     return scores, [["world", "curves", "difference", "probability of improvement"], *differences]
 
 
@@ -160,12 +147,10 @@ def main(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], output: Path =
         output: the picture (.png, .svg or .pdf)
     """
     if output.suffix not in (".png", ".svg", ".pdf"):
-        print(f"plot.py: --output must end in .png, .svg or .pdf, not {output}.", file=sys.stderr)
-        sys.exit(2)
+        raise envs.UsageError(f"--output must end in .png, .svg or .pdf, not {output}.")
     groups = groups_of(read(runs))
     if not groups:
-        print("plot.py: there is no finished run among these.", file=sys.stderr)
-        sys.exit(2)
+        raise envs.UsageError("there is no finished run among these.")
     for world in dict.fromkeys(group.world for group in groups):
         episodes = sorted({group.score.shape[1] for group in groups if group.world == world})
         if len(episodes) > 1:
@@ -179,4 +164,5 @@ def main(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], output: Path =
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    with command_line("plot.py"):
+        tyro.cli(main)

@@ -46,10 +46,7 @@ class Result:
         abouts = [json.loads((run_dir / "args.json").read_text(encoding="utf-8")) for run_dir in run_dirs]
         args = {name: value for name, value in abouts[0]["args"].items() if name not in run.HOUSEKEEPING}
         world = envs.make_world(args["env"])
-        blocks_of_seeds = [np.load(run_dir / "episodes.npz") for run_dir in run_dirs]
-        returns, lengths, outcomes = (
-            np.concatenate([block[name] for block in blocks_of_seeds]) for name in ("returns", "lengths", "outcomes")
-        )
+        returns, lengths, outcomes = map(np.concatenate, zip(*map(episodes_of, run_dirs), strict=True))
         log = envs.EpisodeLog(world, *returns.shape)
         log.returns, log.lengths, log.outcomes = returns, lengths, outcomes
         trials, num_episodes = returns.shape
@@ -86,6 +83,12 @@ class Result:
         path.parent.mkdir(parents=True, exist_ok=True)
         with envs.complete_file(path) as file:
             np.savez_compressed(file, **{**vars(self), "about": json.dumps(self.about)})
+
+
+def episodes_of(run_dir):
+    """The returns, lengths and outcomes [num_trials, num_episodes] of a finished run."""
+    with np.load(run_dir / "episodes.npz") as file:
+        return file["returns"], file["lengths"], file["outcomes"]
 
 
 def sample_episode(method, policy_file, num_agents):

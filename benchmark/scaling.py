@@ -6,19 +6,18 @@ Agents: decespg.py and espg.py clean the maze with 2, 4 and 8 agents; 5 trials, 
 Windows: microseconds per remembered visit, along random play in findtreasure.
 """
 
-import contextlib
 import importlib
-import io
 import sys
-import tempfile
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
+from benchmark.cells import train_aside
 from benchmark.speed import bonus_speed, print_table
 from envs.command import command_line
 
@@ -37,17 +36,13 @@ def clean(method, num_agents, observation, num_episodes):
         spent.append(time.perf_counter() - start)
         return result
 
-    script.VisitNovelty.bonus = timed
-    try:
-        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-            args = dict(env="cleaner", env_args=options, num_trials=TRIALS, seed=1000)
-            script.train(script.Args(num_episodes=1, run_dir=Path(folder) / "warm-up", **args))
-            spent.clear()
-            start = time.perf_counter()
-            run = script.train(script.Args(num_episodes=num_episodes, run_dir=Path(folder) / "run", **args))
-            seconds = time.perf_counter() - start
-    finally:
-        script.VisitNovelty.bonus = bonus
+    args = dict(env="cleaner", env_args=options, num_trials=TRIALS, seed=1000)
+    with patch.object(script.VisitNovelty, "bonus", timed):
+        train_aside(script, num_episodes=1, **args)  # compiles
+        spent.clear()
+        start = time.perf_counter()
+        run = train_aside(script, num_episodes=num_episodes, **args)
+        seconds = time.perf_counter() - start
     steps = run.log.lengths.sum()
     memory = sum(array.nbytes for array in run.novelty.state) / TRIALS / 1000
     cells = envs.optimum("cleaner").best_return.total

@@ -7,10 +7,7 @@ Prints tables of figures and of their ratios, all from this one run. Seconds are
 start-up only), so that other programs disturb little; run it on an otherwise idle machine all the same.
 """
 
-import contextlib
-import dataclasses
 import importlib
-import io
 import subprocess
 import sys
 import tempfile
@@ -27,10 +24,11 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 import envs
+from benchmark.cells import train_aside
 from envs.command import command_line
 
 EPISODES = {"findtreasure": 10_000, "pushbox": 20_000}  # Table 1
-EARLY = {"findtreasure": 200, "pushbox": 200, "gotogether": 20}  # in which teams still explore
+EARLY = {"findtreasure": 200, "pushbox": 200, "gotogether": 20, "movebox": 60}  # in which teams still explore
 NOVELTIES = ("decespg_ex2", "espg_icm", "espg_emi")  # DecESPG or ESPG with another exploration bonus
 
 
@@ -60,13 +58,11 @@ def world_speed(name, num_envs, seconds=1.0):
 def script_speed(method, env, num_trials, num_episodes, **changed):
     """Seconds of a training run and its useful steps (of trials whose episode still runs) per second; `changed` arguments."""
     script = importlib.import_module(f"algos.{method}")
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-        args = script.Args(env=env, num_trials=num_trials, num_episodes=2, run_dir=Path(folder) / "warm-up", **changed)
-        script.train(args)
-        args = dataclasses.replace(args, num_episodes=num_episodes, run_dir=Path(folder) / "run")
-        start = time.process_time()
-        steps = script.train(args).log.lengths.sum()
-        seconds = time.process_time() - start
+    args = dict(env=env, num_trials=num_trials, **changed)
+    train_aside(script, num_episodes=2, **args)  # compiles
+    start = time.process_time()
+    steps = train_aside(script, num_episodes=num_episodes, **args).log.lengths.sum()
+    seconds = time.process_time() - start
     return seconds, steps / seconds
 
 

@@ -4,13 +4,10 @@ python benchmark/visits.py                           # some minutes; draws docs/
 python benchmark/visits.py --methods pg spg decespg --worlds movebox --num-episodes 2000 --output movebox.png
 """
 
-import contextlib
-import dataclasses
-import io
 import sys
-import tempfile
 from pathlib import Path
 from typing import Literal
+from unittest.mock import patch
 
 import matplotlib
 import numpy as np
@@ -20,7 +17,7 @@ from matplotlib.colors import LogNorm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, ROOT, WORLDS, check_words, has_policies, name_of, script
+from benchmark.cells import METHODS, ROOT, WORLDS, check_words, has_policies, name_of, script, train_aside
 from benchmark.figures import agent_places
 from envs.command import command_line
 
@@ -42,14 +39,10 @@ def visits(method, world, optimizer, num_episodes, num_trials):
             for agent, where in enumerate(places.transpose(1, 2, 0)):
                 np.add.at(counts[agent], tuple(where), 1)
 
-    module.Rollout, original = Watched, module.Rollout
     args = dict(env=world.name, num_trials=num_trials, num_episodes=num_episodes)
     args |= dict(optimizer=optimizer) if has_policies(method) else {}
-    try:
-        with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
-            module.train(dataclasses.replace(module.Args(), run_dir=Path(folder) / "run", **args))
-    finally:
-        module.Rollout = original
+    with patch.object(module, "Rollout", Watched):
+        train_aside(module, **args)
     return counts
 
 
