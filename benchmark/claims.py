@@ -517,4 +517,4 @@ def main(publish: bool = False):
 
 if __name__ == "__main__":
     with command_line("claims.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)

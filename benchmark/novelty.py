@@ -117,4 +117,4 @@ def main(
 
 if __name__ == "__main__":
     with command_line("novelty.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)

@@ -165,4 +165,4 @@ def main(runs: Annotated[tuple[Path, ...], tyro.conf.Positional], output: Path =
 
 if __name__ == "__main__":
     with command_line("plot.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)

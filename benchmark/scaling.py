@@ -74,4 +74,4 @@ def main(num_episodes: int = 1000, windows: tuple[int, ...] = (50, 200, 800)):
 
 if __name__ == "__main__":
     with command_line("scaling.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)

@@ -191,4 +191,4 @@ def main(methods: Annotated[tuple[str, ...], tyro.conf.Positional] = ("pg", "dec
 
 if __name__ == "__main__":
     with command_line("speed.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)

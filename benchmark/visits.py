@@ -113,4 +113,4 @@ def main(
 
 if __name__ == "__main__":
     with command_line("visits.py"):
-        tyro.cli(main)
+        tyro.cli(main, description=__doc__)
