@@ -86,9 +86,9 @@ def walk(env, actions):
         yield Step(before, whole_state(env, info), *returned, info)
 
 
-def random_play(num_actions, num_envs=1, longest=60):
-    """Hypothesis: a list of up to `longest` joint actions of two agents in `num_envs` copies, [num_envs, 2] each."""
-    joint = st.tuples(*[st.integers(0, num_actions - 1)] * 2)
+def random_play(num_actions, num_envs=1, longest=60, num_agents=2):
+    """Hypothesis: a list of up to `longest` joint actions in `num_envs` copies, [num_envs, num_agents] each."""
+    joint = st.tuples(*[st.integers(0, num_actions - 1)] * num_agents)
     return st.lists(st.tuples(*[joint] * num_envs), min_size=1, max_size=longest)
 
 

@@ -6,6 +6,7 @@ A state is [row 0, column 0, row 1, column 1]; the door is (3, 2) to (3, 4), the
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
 import envs
 from envs.findtreasure import DOOR, WALL
@@ -107,14 +108,62 @@ def test_own_shows_each_agent_itself():
     ]
 
 
-@given(random_play(5))
-def test_nobody_in_a_wall_or_in_the_other(actions):
-    for step in walk(envs.make_vec("findtreasure"), actions):
-        agents = step.after[0].reshape(2, 2)
+# --- more than two agents ---
+
+
+@pytest.mark.parametrize("holder", range(3))
+def test_any_of_three_may_hold_the_lever(holder):
+    world, walker = envs.make_world("findtreasure", num_agents=3), (holder + 1) % 3
+    before, joint = np.full((3, 2), [5, 1]), np.full(3, WAIT)
+    before[holder], before[walker], joint[walker] = [5, 5], [4, 3], UP
+    after = before.copy()
+    after[walker] = [3, 3]
+    assert play(world, before.ravel(), joint) == (after.ravel().tolist(), 0, 0)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+def test_any_two_of_three_meet_and_any_takes_the_treasure(order):
+    world = envs.make_world("findtreasure", num_agents=3)
+    order = list(order)
+
+    def end_of(places, actions):
+        state, joint = np.zeros((3, 2), int), np.zeros(3, int)
+        state[order], joint[order] = places, actions
+        return play(world, state.ravel(), joint)[1:]
+
+    assert end_of([[5, 5], [4, 4], [1, 1]], [WAIT, RIGHT, WAIT]) == (3, 2)
+    assert end_of([[5, 5], [1, 4], [4, 1]], [WAIT, RIGHT, WAIT]) == (100, 1)
+    assert end_of([[5, 5], [4, 4], [1, 4]], [WAIT, RIGHT, RIGHT]) == (100, 1)  # at once: the treasure, and it alone
+
+
+def test_each_of_three_may_block_and_bump():
+    world = envs.make_world("findtreasure", num_agents=3)
+    assert play(world, [4, 1, 5, 1, 4, 2], (RIGHT, UP, LEFT)) == ([4, 1, 5, 1, 4, 2], -0.3, 0)
+    assert play(world, [4, 2, 5, 1, 4, 1], (RIGHT, RIGHT, RIGHT)) == ([4, 3, 5, 2, 4, 2], 0, 0)  # in order
+
+
+def test_more_agents_start_in_columns_of_two():
+    world = envs.make_world("findtreasure", num_agents=5)
+    assert world.start.reshape(-1, 2).tolist() == [[4, 1], [5, 1], [4, 2], [5, 2], [4, 3]]
+    assert look(world, world.start)[4] == pytest.approx(np.divide([4, 1, 5, 1, 4, 2, 5, 2, 4, 3], 7))
+
+
+def test_the_optimum_of_three():
+    """The agent that starts nearest to the lever needs 4 steps to it, from where the nearest to the door needs 4 more."""
+    optimum = envs.optimum("findtreasure", num_agents=3)
+    assert optimum.best_return[:3] == ("treasure", 8, 100)
+    assert optimum.fewest["meeting"][1:3] == (4, 3)
+
+
+@given(st.integers(2, 4).flatmap(lambda num_agents: random_play(5, num_agents=num_agents)))
+def test_nobody_in_a_wall_or_in_another(actions):
+    num_agents = len(actions[0][0])
+    for step in walk(envs.make_vec("findtreasure", num_agents=num_agents), actions):
+        agents = step.after[0].reshape(-1, 2)
         assert all(WORLD.rules[row, column] != WALL for row, column in agents)
-        assert agents[0].tolist() != agents[1].tolist()
-        assert np.all(np.abs(step.after - step.before).reshape(2, 2).sum(1) <= 1)  # at most one cell each
-        assert step.terminated[0] or round(step.reward[0], 9) in (0, -0.1, -0.2)
+        assert len({tuple(agent) for agent in agents.tolist()}) == num_agents
+        assert np.all(np.abs(step.after - step.before).reshape(-1, 2).sum(1) <= 1)  # at most one cell each
+        assert step.terminated[0] or round(step.reward[0], 9) in [-k / 10 for k in range(num_agents + 1)]
 
 
 @pytest.mark.parametrize(
@@ -127,7 +176,9 @@ def test_nobody_in_a_wall_or_in_the_other(actions):
         ("'positions', 'own'", {"observation": "all"}),
         ("at least 1", {"max_steps": 0}),
         ("at least 1", {"max_steps": True}),
-        ("size, observation, max_steps", {"sise": 7}),
+        ("at least 2", {"num_agents": 1}),
+        ("between 2 and 8", {"num_agents": 9}),
+        ("size, num_agents, observation, max_steps", {"sise": 7}),
     ],
 )
 def test_refused_options(accepted, options):

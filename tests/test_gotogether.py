@@ -6,6 +6,7 @@ A state is [row 0, column 0, row 1, column 1]; the goal is (1, 13).
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import strategies as st
 
 import envs
 from envs.gotogether import WALL
@@ -80,17 +81,58 @@ def test_own_shows_each_agent_itself():
     ]
 
 
-@given(random_play(4))
+# --- more than two agents ---
+
+
+@pytest.mark.parametrize(
+    ("agents", "reward"),
+    [
+        ([[5, 5], [5, 8], [5, 11]], 0),  # a chain: the outer ones are far from each other, but near the middle one
+        ([[5, 5], [5, 8], [5, 12]], -0.5),  # the last one has nobody in reach
+        ([[5, 5], [5, 8], [5, 9]], -0.5),  # two are too close
+        ([[5, 5], [5, 6], [5, 12]], -0.5),  # both at once cost no more
+        ([[2, 2], [2, 4], [9, 9], [9, 11]], 0),  # two pairs
+    ],
+)
+def test_the_nearest_teammate_counts(agents, reward):
+    world = envs.make_world("gotogether", num_agents=len(agents))
+    before = [[row, column + 1] for row, column in agents]
+    after = np.ravel(agents).tolist()
+    assert play(world, np.ravel(before), (LEFT,) * len(agents)) == (after, reward, 0)
+
+
+def test_all_have_to_be_at_the_goal():
+    world = envs.make_world("gotogether", num_agents=3)
+    assert play(world, [1, 12, 2, 13, 2, 13], (RIGHT, UP, UP)) == ([1, 13] * 3, 9.5, 1)
+    assert play(world, [1, 12, 2, 13, 3, 13], (RIGHT, UP, UP)) == ([1, 13, 1, 13, 2, 13], -0.5, 0)
+
+
+def test_more_agents_start_in_two_rows_by_turns():
+    world = envs.make_world("gotogether", size=6, num_agents=4)
+    assert world.start.reshape(-1, 2).tolist() == [[3, 1], [4, 2], [3, 3], [4, 4]]
+    assert look(world, world.start)[3] == pytest.approx(np.divide([3, 1, 4, 2, 3, 3, 4, 4], 6))
+
+
+@pytest.mark.parametrize(("size", "steps"), [(5, 3), (7, 7), (9, 11)])
+def test_the_optimum_of_three(size, steps):
+    """Agent 0 has farthest to go. One step before the end all are within a step of the corner, so two are too close there."""
+    best = envs.optimum("gotogether", size=size, num_agents=3).best_return
+    assert best[:3] == ("goal", steps, 9.0)
+
+
+@given(st.integers(2, 4).flatmap(lambda num_agents: random_play(4, num_agents=num_agents)))
 def test_nobody_in_a_wall_and_the_reward_is_the_distances(actions):
-    for step in walk(envs.make_vec("gotogether", size=5), actions):
-        agents = step.after[0].reshape(2, 2)
-        assert np.all((agents >= 1) & (agents <= 3))
-        assert np.all(np.abs(step.after - step.before).reshape(2, 2).sum(1) <= 1)  # at most one cell each
+    num_agents = len(actions[0][0])
+    for step in walk(envs.make_vec("gotogether", size=6, num_agents=num_agents), actions):
+        agents = step.after[0].reshape(-1, 2)
+        assert np.all((agents >= 1) & (agents <= 4))
+        assert np.all(np.abs(step.after - step.before).reshape(-1, 2).sum(1) <= 1)  # at most one cell each
         if not np.array_equal(step.before, step.after):  # still running
-            distance = ((agents[0] - agents[1]) ** 2).sum()
-            at_goal = agents.tolist() == [[1, 3], [1, 3]]
+            distances = ((agents[:, None] - agents) ** 2).sum(2)
+            nearest = np.where(np.eye(num_agents), np.inf, distances).min(1)
+            at_goal = agents.tolist() == [[1, 4]] * num_agents
             assert step.terminated[0] == at_goal
-            assert step.reward[0] == (0 if 2 <= distance <= 9 else -0.5) + 10 * at_goal
+            assert step.reward[0] == -0.5 * bool(((nearest < 2) | (nearest > 9)).any()) + 10 * at_goal
 
 
 @pytest.mark.parametrize(
@@ -100,7 +142,9 @@ def test_nobody_in_a_wall_and_the_reward_is_the_distances(actions):
         ("at least 5", {"size": "large"}),
         ("'positions', 'own'", {"observation": "all"}),
         ("at least 1", {"max_steps": 0}),
-        ("size, observation, max_steps", {"num_agents": 3}),
+        ("at least 2", {"num_agents": 1}),
+        ("between 2 and 3", {"size": 5, "num_agents": 4}),
+        ("size, num_agents, observation, max_steps", {"agents": 3}),
     ],
 )
 def test_refused_options(accepted, options):
