@@ -257,8 +257,8 @@ def selection(args):
         if not path_of(word).is_file():
             refuse(f"there is no script {word!r}; there is {', '.join(METHODS)}, or a file such as my_method.py.")
     for word in args.envs:
-        if word not in WORLDS and not (word.endswith(".py") and Path(word).is_file()):
-            refuse(f"there is no world {word!r}; there is {', '.join(WORLDS)}, or a file such as my_world.py.")
+        if word not in envs.WORLDS and not (word.endswith(".py") and Path(word).is_file()):
+            refuse(f"there is no world {word!r}; there is {', '.join(envs.WORLDS)}, or a file such as my_world.py.")
     if not (seeds := seeds_of(args.seeds)):
         refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
     if args.episodes is not None:

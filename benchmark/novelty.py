@@ -18,7 +18,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, ROOT, WORLDS, check_words, name_of, script, train_aside
+from benchmark.cells import METHODS, ROOT, check_words, name_of, script, train_aside
 from benchmark.figures import DASHES, colour_of
 from benchmark.report import markdown
 from envs.command import command_line
@@ -93,7 +93,7 @@ def main(
         num_episodes: episodes of each trial
     """
     check_words("script", methods, METHODS)
-    check_words("world", worlds, WORLDS)
+    check_words("world", worlds, envs.WORLDS)
     for name, number in (("--num-episodes", num_episodes), ("--num-trials", num_trials)):
         envs.check_whole(name, number, minimum=1)
     if not (methods and worlds):

@@ -94,7 +94,7 @@ def main(
         output: the picture
     """
     check_words("script", methods, METHODS)
-    check_words("world", worlds, WORLDS)
+    check_words("world", worlds, envs.WORLDS)
     for name, number in (("--num-episodes", num_episodes), ("--num-trials", num_trials)):
         envs.check_whole(name, number, minimum=1)
     if not (methods and worlds):

@@ -19,7 +19,7 @@ from envs.command import command_line
 @dataclass
 class Args:
     world: tyro.conf.Positional[str]
-    """cleaner, findtreasure, gotogether, movebox or pushbox, or a file with a world of your own such as my_world.py"""
+    """cleaner, climbing, findtreasure, gotogether, movebox, passage, pushbox or secretroom, or a file such as my_world.py"""
     options: tyro.conf.Positional[tuple[str, ...]] = ()
     """options of the world, such as size=6 (envs/<world>.py lists them)"""
     keys: bool = False
@@ -54,7 +54,8 @@ def play(args: Args):
         done = ", ".join(f"agent {i} {env.world.action_names[action]}" for i, action in enumerate(actions))
         print(f"\nstep {steps}: {done}; the team earned {reward:g} ({total:g} so far)\n{describe(env, obs)}")
     end = ("time limit", *env.world.outcome_names)[outcome]
-    print(f"\nend: {end} after {steps} steps, return {total:g}, {envs.reward_per_step(total, steps):.2f} per step")
+    length = f"{steps} step{'s' * (steps != 1)}"
+    print(f"\nend: {end} after {length}, return {total:g}, {envs.reward_per_step(total, steps):.2f} per step")
 
 
 def describe(env, obs):

@@ -28,6 +28,8 @@ CELLS = {
     "near goal": "#fdf0bd",
     "far goal": "#b5e0bf",
     "dirt": "#a8d9b0",
+    **{"11": "#2c9f4b", "10": "#2c9f4b", "7": "#74bd86", "6": "#8fcb9b", "5": "#b5e0bf", "2": "#b5e0bf"},  # payoffs
+    **{"0": "#ececec", "penalty": "#e0705f"},
 }
 BOXES = {"small box": "#e6c79b", "large box": "#c08f5a", "box": "#c08f5a"}
 OTHERS = ("#c9b6e4", "#9fd8df", "#f2b8a0", "#c5d86d", "#e3a6c4")  # for kinds in a world of the user's own

@@ -16,6 +16,7 @@ from envs.command import command_line
 from envs.drawing import INK, PAPER
 
 SIDE, GAP, TEXT = 420, 40, 30  # pixels: a map's side (at most), the space between two maps, the names' letters
+IN_A_ROW = 4
 FILM, SECONDS = 300, 8  # pixels: the side of a film's map (at most); how long a film is (at most)
 
 
@@ -29,7 +30,8 @@ class Args:
 
 def gallery():
     """The picture, uint8 [height, width, 3]: every world at its start, cleaner after some steps of its plan."""
-    page = Image.new("RGB", (len(envs.WORLDS) * (SIDE + GAP) - GAP, SIDE + 2 * TEXT), PAPER)
+    rows = -(-len(envs.WORLDS) // IN_A_ROW)
+    page = Image.new("RGB", (IN_A_ROW * (SIDE + GAP) - GAP, rows * (SIDE + 2 * TEXT)), PAPER)
     for k, name in enumerate(envs.WORLDS):
         world = envs.make_world(name)
         state = world.start.copy()
@@ -37,9 +39,9 @@ def gallery():
             for actions in world.plan()[:16]:
                 world.step(world.rules, state, actions)
         picture = Image.fromarray(envs.draw(world, state, cell=SIDE // max(world.sketch(state)[:2])))
-        left = k * (SIDE + GAP)
-        page.paste(picture, (left + (SIDE - picture.width) // 2, (SIDE - picture.height) // 2))
-        place, font = (left + SIDE / 2, SIDE + TEXT), ImageFont.load_default(TEXT)
+        left, top = k % IN_A_ROW * (SIDE + GAP), k // IN_A_ROW * (SIDE + 2 * TEXT)
+        page.paste(picture, (left + (SIDE - picture.width) // 2, top + (SIDE - picture.height) // 2))
+        place, font = (left + SIDE / 2, top + SIDE + TEXT), ImageFont.load_default(TEXT)
         ImageDraw.Draw(page).text(place, type(world).__name__, INK, font, anchor="mm")
     return np.asarray(page)
 

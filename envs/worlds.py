@@ -10,12 +10,16 @@ from pathlib import Path
 
 from envs.base import UsageError, World
 from envs.cleaner import Cleaner
+from envs.climbing import Climbing
 from envs.findtreasure import FindTreasure
 from envs.gotogether import GoTogether
 from envs.movebox import MoveBox
+from envs.passage import Passage
 from envs.pushbox import PushBox
+from envs.secretroom import SecretRoom
 
-WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox)}
+# The paper's, and those on which others judge exploration and coordination.
+WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox, Climbing, Passage, SecretRoom)}
 
 
 def make_world(name: str, **options) -> World:

@@ -34,7 +34,11 @@ each_setting = pytest.mark.parametrize(
     ("env", "optimizer"), list(itertools.product(("findtreasure", "pushbox"), ("sign", "adam")))
 )
 RACE = Path(__file__).parent / "data" / "race.py"  # a world of the user's own
-RECORDED = json.loads((Path(__file__).parent / "data" / "trajectories.json").read_text(encoding="utf-8"))
+RECORDED = {
+    name: recording
+    for file in ("trajectories.json", "rooms.json")
+    for name, recording in json.loads((Path(__file__).parent / "data" / file).read_text(encoding="utf-8")).items()
+}
 # The shortest way to the best outcome, a list of joint actions; of cleaner, which has no outcomes, its constructed plan.
 BEST_PLANS = {
     "cleaner": envs.make_world("cleaner").plan().tolist(),
@@ -42,6 +46,16 @@ BEST_PLANS = {
     "gotogether": [(0, 0)] * 11 + [(3, 3)] * 11 + [(3, 0)],
     "movebox": [(0, 0)] * 3 + [(3, 2)] * 5 + [(2, 2)] * 4 + [(0, 0)] * 6 + [(3, 3)] * 4 + [(0, 0)] * 3,
     "pushbox": [(0, 0), (1, 2), (0, 0), (0, 0)],
+    "climbing": [(0, 0)],
+    "passage": [(0, 1)] * 2 + [(1, 2)] * 4 + [(2, 2)] * 4 + [(1, 0)] * 2 + [(0, 0)] * 2 + [(1, 1)] * 2 + [(0, 1)] * 2,
+    "secretroom": [(0, 1)] * 2
+    + [(0, 2)] * 4
+    + [(1, 2)] * 4
+    + [(1, 0)]
+    + [(0, 0)] * 4
+    + [(1, 0)] * 2
+    + [(1, 1), (2, 1)]
+    + [(0, 1)] * 2,
 }
 
 
@@ -93,7 +107,7 @@ def random_play(num_actions, num_envs=1, longest=60, num_agents=2):
 
 
 def assert_replays(recording, to_state, **options):
-    """All recorded episodes of tests/data/trajectories.json under the key `recording` go the same way, step by step.
+    """All recorded episodes of tests/data/*.json under the key `recording` go the same way, step by step.
 
     to_state: turns the positions of the file into the world's integer state, or the part of it that they tell
     """
@@ -103,7 +117,7 @@ def assert_replays(recording, to_state, **options):
     for episode in episodes:
         steps = list(walk(env, episode["actions"]))
         for step, positions in zip(steps, episode["positions"], strict=True):
-            if positions is not None:  # the published movebox starts anew in its last step
+            if positions is not None:  # the published movebox, passage and secretroom start anew in their last step
                 expected = to_state(positions)
                 assert step.after[0, : len(expected)].tolist() == expected
         assert [step.reward[0] for step in steps] == pytest.approx(episode["rewards"], abs=1e-9)
