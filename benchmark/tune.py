@@ -47,6 +47,9 @@ BETAS = {
     "gotogether": (0.03, 0.1, 0.3),
     "cleaner": (0.01, 0.03, 0.1),
     "movebox": (0.03, 0.1, 0.3),
+    "climbing": (0.1, 0.3, 1.0),
+    "passage": (0.03, 0.1, 0.3),
+    "secretroom": (0.03, 0.1, 0.3),
 }
 # The bonuses of learnt models have other scales.
 EXEMPLAR_BETAS = {
