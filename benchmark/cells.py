@@ -24,7 +24,8 @@ from envs import run
 from envs.command import one_line
 
 RUNS = ROOT / "runs" / "comparison"
-WORLDS = ("cleaner", "findtreasure", "gotogether", "movebox", "pushbox")  # the paper's; others come after them
+WORLDS = ("cleaner", "findtreasure", "gotogether", "movebox", "pushbox")  # the paper's
+BEYOND_WORLDS = ("climbing", "passage", "secretroom")
 OPTIMIZERS = ("sign", "adam")
 # The paper's, in the order of every table. Any other script, of algos/ or named by its path, is called as its file is.
 METHODS = {
@@ -43,11 +44,13 @@ METHODS = {
     "espg_emi": "ESPG+EMI",
     "gasil": "GASIL",
 }
+# Beyond the paper, under a heading of their own.
+BEYOND = {"hysteretic": "Hysteretic DQN", "ippo": "IPPO", "mappo": "MAPPO", "qmix": "QMIX"}
 
 
 def name_of(method):
     """What tables and figures call a method."""
-    return METHODS.get(method, Path(method).stem)
+    return (METHODS | BEYOND).get(method, Path(method).stem)
 
 
 def path_of(method):

@@ -18,6 +18,7 @@ from matplotlib import pyplot as plt
 COLOURS = {
     **{"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"},
     **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#b3a100", "dqn": "#000000", "edti": "#882255"},
+    **{"hysteretic": "#332288", "ippo": "#44aa99", "mappo": "#117733", "qmix": "#aa4499"},
     **{"decespg_ex2": "#009e73", "espg_icm": "#d55e00", "espg_emi": "#cc79a7", "gasil": "#e69f00"},
 }
 OTHERS = ("#332288", "#44aa99", "#aa4499", "#999933")  # of scripts that are not the paper's
@@ -31,11 +32,16 @@ DASHES = {
     "espg_icm": "-.",
     "espg_emi": ":",
     "gasil": "--",
+    "hysteretic": "-.",
+    "qmix": "--",
+    "ippo": "-.",
+    "mappo": "--",
 }
 FIGURES = {
     "figure3": ("pg", "ac", "coma", "acer", "dqn", "edti", "espg", "decespg"),
     "figure4": ("pg", "epg", "spg", "espg", "decespg"),
     "figure6": ("decespg_ex2", "espg_icm", "espg_emi", "gasil", "espg", "decespg"),
+    "beyond": ("pg", "coma", "dqn", "edti", "hysteretic", "qmix", "ippo", "mappo", "spg", "decespg"),
 }
 
 

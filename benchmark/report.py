@@ -174,15 +174,15 @@ def time_needed(found, cores=2):
 
 def all_figures(found):
     """{name: figure} of what can be drawn from the results."""
-    drawn = {}
+    drawn, beyond, found = {}, results.beyond_the_paper(found), results.of_the_paper(found)
     others = results.named_in(found)[1][len(METHODS) :]
     for name, methods in figures.FIGURES.items():
-        methods = (*methods, *others)
+        part, methods = (beyond, methods) if name == "beyond" else (found, (*methods, *others))
         own = [method for method in methods if method not in ("pg", "espg", "decespg")]
-        if any(method in own for _, method, _ in found):
-            drawn[name] = figures.learning_curves(found, methods)
-            drawn[f"{name}-steps"] = figures.curves_over_steps(found, methods)
-            drawn[f"{name}-best"] = figures.share_at_best(found, methods)
+        if any(method in own for _, method, _ in part):
+            drawn[name] = figures.learning_curves(part, methods)
+            drawn[f"{name}-steps"] = figures.curves_over_steps(part, methods)
+            drawn[f"{name}-best"] = figures.share_at_best(part, methods)
     if any(all((r := found.get((world, m, "sign"))) and len(r.actions) for m in ("pg", "decespg")) for world in WORLDS):
         drawn["figure5"] = figures.trajectories(found)
     if worlds := worlds_of_all(found):
@@ -253,6 +253,7 @@ CAPTIONS = {
     "figure3": "Figure 3: the baselines. Mean and standard error over the trials",
     "figure4": "Figure 4: the ablation, what bonus and memory do by themselves",
     "figure6": "Figure 6: single components exchanged",
+    "beyond": "Beyond the paper: other methods and other worlds",
     "figure5": "Figure 5: ways of trained teams (first trial, sign), from the rings on",
     "iqm": "Interquartile mean, 95 % stratified bootstrap intervals (rliable)",
     "improvement": "Probability that a trial of DecESPG ends better than one of the method (0.5: no difference)",
@@ -267,7 +268,8 @@ MORE = {
 def page(found, drawn):
     """report.html."""
     parts = ["<h1>Cooperative multi-agent exploration: the comparison</h1>"]
-    there = f"{len(found)} of {len(select(METHODS, WORLDS, OPTIMIZERS))} cells are there"
+    paper = results.of_the_paper(found)
+    there = f"{len(paper)} of {len(select(METHODS, WORLDS, OPTIMIZERS))} cells of the paper's are there"
     parts.append(f"<p>{datetime.now():%Y-%m-%d}: {there}, made with {versions(found)}. {time_needed(found)}</p>")
     parts += ["<h2>Reward per step, last 5 % of the episodes</h2>", html_table(score_table(found))]
     parts += ["<h2>DecESPG minus SPG: what the bonus adds to the memory</h2>", html_table(difference_table(found))]
@@ -294,10 +296,17 @@ def publish(found, drawn):
     for name, figure in drawn.items():
         figure.savefig(DOCS / f"{name}.png", dpi=130)
     tables = dict(scores=score_table, differences=difference_table, leaderboard=leaderboard)
-    for path, names in ((README, {"best": best_table}), (DOCS / "results.md", tables)):
+    paper, beyond = results.of_the_paper(found), results.beyond_the_paper(found)
+    beyond_tables = dict(scores=score_table, leaderboard=leaderboard)
+    pages = (
+        (README, paper, {"best": best_table}),
+        (DOCS / "results.md", paper, tables),
+        (DOCS / "beyond.md", beyond, beyond_tables),
+    )
+    for path, part, names in pages:
         text = path.read_text(encoding="utf-8")
         for name, table in names.items():
-            text = rewrite(text, name, markdown(table(found)))
+            text = rewrite(text, name, markdown(table(part)))
         path.write_text(text, encoding="utf-8")
 
 

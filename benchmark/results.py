@@ -10,7 +10,19 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, WORLDS, Cell, path_of, script, seconds_of, settings_of
+from benchmark.cells import (
+    BEYOND,
+    BEYOND_WORLDS,
+    METHODS,
+    OPTIMIZERS,
+    ROOT,
+    WORLDS,
+    Cell,
+    path_of,
+    script,
+    seconds_of,
+    settings_of,
+)
 from envs import run
 from envs.command import one_line
 
@@ -178,7 +190,7 @@ def in_order(found):
     """Results in the order of the tables, those of other worlds and methods last."""
 
     def place(key):
-        orders = list(WORLDS), list(METHODS), list(OPTIMIZERS)
+        orders = [*WORLDS, *BEYOND_WORLDS], [*METHODS, *BEYOND], list(OPTIMIZERS)
         return [order.index(word) if word in order else len(order) for order, word in zip(orders, key, strict=True)]
 
     return {key: found[key] for key in sorted(found, key=place)}
@@ -187,6 +199,17 @@ def in_order(found):
 def named_in(found):
     """The worlds and the methods of results: the paper's, and whatever others there are."""
     return [list(dict.fromkeys((*own, *(key[place] for key in found)))) for place, own in ((0, WORLDS), (1, METHODS))]
+
+
+def of_the_paper(found):
+    """Results without those of the worlds and methods beyond the paper; anybody's own are there."""
+    return {key: result for key, result in found.items() if not (key[0] in BEYOND_WORLDS or key[1] in BEYOND)}
+
+
+def beyond_the_paper(found):
+    """The results of all worlds in which there is one that is not `of_the_paper`, without anybody's own methods."""
+    worlds = {world for world, method, _ in found if world in BEYOND_WORLDS or method in BEYOND}
+    return {key: result for key, result in found.items() if key[0] in worlds and key[1] in METHODS | BEYOND}
 
 
 def seconds_per_episode(results):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmark import figures, report, results
-from benchmark.cells import METHODS, Cell
+from benchmark.cells import BEYOND, METHODS, Cell
 from tests.helpers import BEST_PLANS, assert_refused, script, train
 
 
@@ -25,12 +25,39 @@ def test_tables_are_written_between_their_marks():
 
 def test_the_published_tables_are_those_of_the_kept_results(kept):
     assert len(kept) >= 54
-    assert {result.num_episodes for result in kept.values()} == {10_000, 20_000}
+    for (world, method, _), result in kept.items():
+        assert result.num_episodes == script(method).WORLDS[world]["num_episodes"]
     assert all(len(result.about["commit"]) == 40 for result in kept.values())
-    assert report.markdown(report.best_table(kept)) in report.README.read_text(encoding="utf-8")
+    paper, beyond = results.of_the_paper(kept), results.beyond_the_paper(kept)
+    assert report.markdown(report.best_table(paper)) in report.README.read_text(encoding="utf-8")
     text = (report.DOCS / "results.md").read_text(encoding="utf-8")
     for table in (report.score_table, report.difference_table, report.leaderboard):
-        assert report.markdown(table(kept)) in text
+        assert report.markdown(table(paper)) in text
+    text = (report.DOCS / "beyond.md").read_text(encoding="utf-8")
+    for table in (report.score_table, report.leaderboard):
+        assert report.markdown(table(beyond)) in text
+
+
+def test_what_is_beyond_the_paper_stands_by_itself(kept):
+    some = {key: kept[key] for key in [("pushbox", "pg", "sign"), ("pushbox", "coma", "adam"), ("findtreasure", "pg", "sign")]}
+    result = some["pushbox", "pg", "sign"]
+    more = {("pushbox", "mappo", "adam"): result, ("passage", "pg", "sign"): result, ("pushbox", "mine", "sign"): result}
+    found = results.in_order({**more, **some})
+    assert results.of_the_paper(found).keys() == {*some, ("pushbox", "mine", "sign")}
+    beyond = results.beyond_the_paper(found)
+    assert list(beyond) == [
+        ("pushbox", "pg", "sign"),
+        ("pushbox", "coma", "adam"),
+        ("pushbox", "mappo", "adam"),
+        ("passage", "pg", "sign"),
+    ]
+    drawn = report.all_figures(found)
+    assert {axis.get_title() for axis in drawn["beyond"].axes if axis.get_visible()} == {
+        "pushbox, sign",
+        "pushbox, adam",
+        "passage, sign",
+    }
+    assert "passage, sign" not in {axis.get_title() for axis in drawn["figure3"].axes}
 
 
 def test_the_leaderboard_counts_until_95_percent_are_there(kept):
@@ -51,8 +78,8 @@ def test_the_best_of_each_world_is_named(kept):
 
 
 def test_every_method_has_its_own_look():
-    looks = {(figures.COLOURS[method], figures.DASHES.get(method, "-")) for method in METHODS}
-    assert len(looks) == len(METHODS)
+    looks = {(figures.COLOURS[method], figures.DASHES.get(method, "-")) for method in METHODS | BEYOND}
+    assert len(looks) == len(METHODS | BEYOND)
 
 
 def test_curves_show_mean_error_and_optimum(kept):
