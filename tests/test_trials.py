@@ -18,7 +18,7 @@ def test_trials_are_runs(name, setting, tmp_path, monkeypatch):
     assert_trials_are_runs(script(name), tmp_path, 1e-9, **setting)
 
 
-ONE_KIND = ("pg", "epg", "spg", "espg", "decespg", "dqn")
+ONE_KIND = ("pg", "epg", "spg", "espg", "decespg", "dqn", "hysteretic")
 
 
 @pytest.mark.parametrize("name", ONE_KIND)
