@@ -85,6 +85,7 @@ OWN = {
     "acer": ("critic_learning_rate", dict.fromkeys(EPISODES, (3e-4, 1e-3, 3e-3))),
     "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "hysteretic": ("hysteresis", dict.fromkeys(EPISODES, (0.1, 0.2, 0.4))),
+    "qmix": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
     "decespg_ex2": ("beta", EXEMPLAR_BETAS),
     "espg_icm": ("beta", CURIOSITY_BETAS),

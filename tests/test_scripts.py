@@ -250,6 +250,7 @@ FIGURES = {
     "acer": ["value", "trust_region"],
     "dqn": ["epsilon", "value"],
     "hysteretic": ["epsilon", "value"],
+    "qmix": ["epsilon", "value"],
     "gasil": [*BONUS, "d_good", "d_own"],
     "decespg_ex2": ["bonus", "cross_entropy", "overvisited"],
 }
@@ -364,6 +365,7 @@ BAD_INPUT_OF = {
         "--hysteresis -0.1": "--hysteresis must be a number between 0 and 1, not -0.1",
         "--hysteresis 1.1": "--hysteresis must be a number between 0 and 1, not 1.1",
     },
+    "qmix": BAD_REPLAY,
     "decespg_ex2": {
         **BAD_MEMORY,
         "--beta -1": "--beta must be a number of at least 0, not -1",
