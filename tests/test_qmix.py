@@ -1,5 +1,6 @@
 """QMIX and VDN: mixing, monotonicity, error and updates beside plain ones, one agent is DQN, the two-step game."""
 
+from copy import deepcopy
 from itertools import groupby, product
 
 import numpy as np
@@ -199,6 +200,16 @@ def test_the_end_of_the_world_has_exactly_its_reward_as_target(kind, monkeypatch
     assert torch.equal(*errors)
     going_on = random_batch(np.random.default_rng(0), terminated=0)
     assert not torch.equal(errors[0], qmix.squared_td_errors(policy, mixer, policy, mixer, going_on, 0.9))
+
+
+@pytest.mark.parametrize("kind", ["monotonic", "sum"])
+def test_no_gradient_flows_through_the_target(kind, monkeypatch):
+    policy, mixer = networks(monkeypatch, (0, 1), kind)
+    learning, grads = [*policy.params, *mixer.params], []
+    for target in (policy, mixer), (deepcopy(policy), deepcopy(mixer)):
+        error = qmix.squared_td_errors(policy, mixer, *target, random_batch(np.random.default_rng(0), terminated=0), 0.9)
+        grads.append(torch.autograd.grad(error.sum(), learning))
+    assert all(map(torch.equal, *grads))
 
 
 @pytest.mark.parametrize("kind", ["monotonic", "sum"])
