@@ -84,7 +84,7 @@ def train_aside(module, **args):
 
 
 def has_policies(method):
-    """Whether a method has policy networks, and so a choice of their optimiser; Q-learning has none and always uses Adam."""
+    """Whether a method has a choice of its policies' optimiser; Q-learning has no policies, and PPO always uses Adam."""
     return any(field.name == "optimizer" for field in fields(script(method).Args))
 
 

@@ -90,6 +90,8 @@ OWN = {
     "decespg_ex2": ("beta", EXEMPLAR_BETAS),
     "espg_icm": ("beta", CURIOSITY_BETAS),
     "espg_emi": ("beta", EMBEDDING_BETAS),
+    "ippo": ("entropy_coef", dict.fromkeys(EPISODES, (0.003, 0.01, 0.03))),
+    "mappo": ("entropy_coef", dict.fromkeys(EPISODES, (0.003, 0.01, 0.03))),
     "gasil": (
         "lambda_im",
         dict.fromkeys(EPISODES, (3.0, 10.0, 30.0)) | {"gotogether": (0.3, 1.0, 3.0), "cleaner": (0.1, 0.3, 1.0)},

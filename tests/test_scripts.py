@@ -242,6 +242,7 @@ def test_a_world_of_ones_own_gets_the_values_that_the_help_names(name, tmp_path,
 
 WORDS = ["--env", "findtreasure", "--max-steps", 40, "--hidden", 16, "--num-trials", 2, "--seed", 5, "--num-episodes", 40]
 BONUS, CRITIC, LOSS = ["bonus", "unvisited", "overvisited"], ["value", "td_error"], ["losses/policy_loss", "losses/entropy"]
+PPO = ["value", "advantage", "kl", "clip_fraction"]
 FIGURES = {
     **{"pg": [], "spg": [], "epg": BONUS, "espg": BONUS, "decespg": BONUS, "ac": CRITIC, "coma": CRITIC},
     "edti": [*CRITIC, "novelty", "influence", "table_fill"],
@@ -251,6 +252,8 @@ FIGURES = {
     "dqn": ["epsilon", "value"],
     "hysteretic": ["epsilon", "value"],
     "qmix": ["epsilon", "value"],
+    "ippo": PPO,
+    "mappo": PPO,
     "gasil": [*BONUS, "d_good", "d_own"],
     "decespg_ex2": ["bonus", "cross_entropy", "overvisited"],
 }
@@ -329,6 +332,12 @@ BAD_REPLAY = {
     "--batch-size 0": "--batch-size must be a number of at least 1, not 0",
     "--train-every 0": "--train-every must be a number of at least 1, not 0",
     "--target-every 0": "--target-every must be a number of at least 1, not 0",
+BAD_PPO = {
+    "--entropy-coef -1": "--entropy-coef must be a number of at least 0, not -1",
+    "--gae-lambda 1.1": "--gae-lambda must be a number between 0 and 1, not 1.1",
+    "--clip -1": "--clip must be a number of at least 0, not -1",
+    "--episodes-per-update 0": "--episodes-per-update must be a number of at least 1, not 0",
+    "--num-epochs 0": "--num-epochs must be a number of at least 1, not 0",
 }
 BAD_INPUT_OF = {
     "spg": BAD_MEMORY,
@@ -366,6 +375,8 @@ BAD_INPUT_OF = {
         "--hysteresis 1.1": "--hysteresis must be a number between 0 and 1, not 1.1",
     },
     "qmix": BAD_REPLAY,
+    "ippo": BAD_PPO,
+    "mappo": BAD_PPO,
     "decespg_ex2": {
         **BAD_MEMORY,
         "--beta -1": "--beta must be a number of at least 0, not -1",
