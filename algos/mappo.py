@@ -31,13 +31,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from envs import Rollout, distinct_rows, in_every_step
 from envs.run import AtLeast, Between, Run, RunArgs, generators_of, main, resolve
 
-# Table 1 of the paper.
+# Table 1 of the paper; climbing, passage and secretroom are beyond it.
 WORLDS = {
     "cleaner": dict(hidden=(256, 128), gamma=0.99, max_steps=200, num_episodes=20_000),
     "findtreasure": dict(hidden=(64,), gamma=0.98, max_steps=200, num_episodes=10_000),
     "gotogether": dict(hidden=(64,), gamma=0.98, max_steps=2000, num_episodes=10_000),
     "movebox": dict(hidden=(256, 128), gamma=0.999, max_steps=200, num_episodes=20_000),
     "pushbox": dict(hidden=(64, 32), gamma=0.95, max_steps=200, num_episodes=20_000),
+    "climbing": dict(hidden=(64,), gamma=0.99, max_steps=1, num_episodes=5_000),
+    "passage": dict(hidden=(64,), gamma=0.99, max_steps=200, num_episodes=10_000),
+    "secretroom": dict(hidden=(64,), gamma=0.99, max_steps=200, num_episodes=10_000),
 }
 # The tuning rule's choice for each world (benchmark/tuning/mappo.csv), guesses where it has no row yet; it is always Adam's.
 TUNED = {

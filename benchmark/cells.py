@@ -83,8 +83,8 @@ def train_aside(module, **args):
         return module.train(module.Args(run_dir=Path(folder) / "run", **args))
 
 
-def has_policies(method):
-    """Whether a method has a choice of its policies' optimiser; Q-learning has no policies, and PPO always uses Adam."""
+def takes_optimizer(method):
+    """Whether a method lets its policies' optimiser be chosen; Q-learning, which has no policies, and PPO always use Adam."""
     return any(field.name == "optimizer" for field in fields(script(method).Args))
 
 
@@ -107,7 +107,7 @@ class Cell:
         """What the script is told besides `env_args` and `own`, {argument: value}."""
         world = self.world if self.world in envs.WORLDS else str(Path(self.world).resolve())
         told = dict(env=world, seed=self.first_seed, num_trials=self.num_trials)
-        if has_policies(self.method):
+        if takes_optimizer(self.method):
             told["optimizer"] = self.optimizer
         return told if self.num_episodes is None else {**told, "num_episodes": self.num_episodes}
 
@@ -219,7 +219,7 @@ def settings_of(run_dir):
 
 
 def select(methods, worlds, optimizers, **block):
-    """The cells of a selection, in the order of the tables; a method without policies has one cell, under "adam".
+    """The cells of a selection, in the order of the tables; one that takes no optimiser has one cell, under "adam".
 
     block: the other fields of all cells
     """
@@ -228,5 +228,5 @@ def select(methods, worlds, optimizers, **block):
         for world in worlds
         for method in methods
         for optimizer in optimizers
-        if has_policies(method) or optimizer == "adam"
+        if takes_optimizer(method) or optimizer == "adam"
     ]

@@ -27,7 +27,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark import results
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seconds_of, seeds_of, select
+from benchmark.cells import BEYOND, METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, path_of, seconds_of, seeds_of, select
 from envs.command import Forgiving, command_line
 from envs.run import HOUSEKEEPING
 
@@ -255,7 +255,7 @@ def selection(args):
     """The cells that the arguments select."""
     for word in args.algos:
         if not path_of(word).is_file():
-            refuse(f"there is no script {word!r}; there is {', '.join(METHODS)}, or a file such as my_method.py.")
+            refuse(f"there is no script {word!r}; there is {', '.join(METHODS | BEYOND)}, or a file such as my_method.py.")
     for word in args.envs:
         if word not in envs.WORLDS and not (word.endswith(".py") and Path(word).is_file()):
             refuse(f"there is no world {word!r}; there is {', '.join(envs.WORLDS)}, or a file such as my_world.py.")
@@ -270,7 +270,7 @@ def selection(args):
     cells = select(args.algos, args.envs, args.optimizers, env_args=args.env_args, **block)
     cells = [dataclasses.replace(cell, own=own) for cell in cells for own in combinations(args.args)]
     if not cells:
-        refuse("nothing is selected; a method without policies is run under adam only.")
+        refuse("nothing is selected; methods without --optimizer, Q-learning and PPO, are run under adam only.")
     for cell in cells:
         cell.settings  # noqa: B018 - what is impossible is said before anything runs
     return cells

@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import ROOT, check_words, has_policies
+from benchmark.cells import ROOT, check_words, takes_optimizer
 from envs.command import command_line, one_line
 
 # A quarter of Table 1, and of what the worlds beyond it have.
@@ -121,7 +121,7 @@ class Cell:
         run_dir = ROOT / "runs" / "tuning" / self.method / "-".join(word for word in self.key if word)
         command = [sys.executable, ROOT / "algos" / f"{self.method}.py", "--env", self.world, "--seed", 1000, "--num-trials", 5]
         command += ["--num-episodes", EPISODES[self.world], "--run-dir", run_dir]
-        command += ["--optimizer", self.optimizer] if has_policies(self.method) else []
+        command += ["--optimizer", self.optimizer] if takes_optimizer(self.method) else []
         command += ["--learning-rate", self.learning_rate, *([f"--{own.replace('_', '-')}", self.value] if own else [])]
         if not (run_dir / "episodes.npz").exists():
             command += ["--resume"] if (run_dir / "checkpoint.pt").exists() else []
@@ -150,7 +150,7 @@ class Table:
     def cells(self, world, optimizer):
         """The grid of one world and optimiser."""
         values, rates = OWN[self.method][1].get(world, ()), LEARNING_RATES[optimizer]
-        if optimizer == "sign" and not has_policies(self.method):
+        if optimizer == "sign" and not takes_optimizer(self.method):
             return []
         if values and world in SAME_SIZE:
             rates = [self.best(SAME_SIZE[world], optimizer).learning_rate]

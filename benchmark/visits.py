@@ -17,7 +17,7 @@ from matplotlib.colors import LogNorm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
-from benchmark.cells import METHODS, ROOT, WORLDS, check_words, has_policies, name_of, script, train_aside
+from benchmark.cells import BEYOND, METHODS, ROOT, WORLDS, check_words, name_of, script, takes_optimizer, train_aside
 from benchmark.figures import agent_places
 from envs.command import command_line
 
@@ -40,7 +40,7 @@ def visits(method, world, optimizer, num_episodes, num_trials):
                 np.add.at(counts[agent], tuple(where), 1)
 
     args = dict(env=world.name, num_trials=num_trials, num_episodes=num_episodes)
-    args |= dict(optimizer=optimizer) if has_policies(method) else {}
+    args |= dict(optimizer=optimizer) if takes_optimizer(method) else {}
     with patch.object(module, "Rollout", Watched):
         train_aside(module, **args)
     return counts
@@ -93,7 +93,7 @@ def main(
         num_trials: trials of each script
         output: the picture
     """
-    check_words("script", methods, METHODS)
+    check_words("script", methods, METHODS | BEYOND)
     check_words("world", worlds, envs.WORLDS)
     for name, number in (("--num-episodes", num_episodes), ("--num-trials", num_trials)):
         envs.check_whole(name, number, minimum=1)

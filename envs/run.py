@@ -116,7 +116,7 @@ def resolve(args, worlds, tuned, other):
     has chosen. other: {argument: value} of worlds that these tables do not know.
     """
     args = type(args)(**{name: envs.plain(value) for name, value in vars(args).items()})
-    optimizer = getattr(args, "optimizer", "adam")  # Q-learning has no policies, and Adam always
+    optimizer = getattr(args, "optimizer", "adam")  # Q-learning and PPO always use Adam
     known = {**worlds.get(args.env, {}), **tuned.get((args.env, optimizer), {})}
     defaults = {"num_episodes": 10_000, **other, **known, "run_dir": default_run_dir(args)}
     values = {name: defaults.get(name) if value is None else value for name, value in vars(args).items()}

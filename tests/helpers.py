@@ -148,9 +148,9 @@ def script(name):
 
 
 def optimizers(name):
-    """What --optimizer may be, as arguments of `train`; a script without policies has no such option."""
-    has_policies = "optimizer" in [field.name for field in fields(script(name).Args)]
-    return [dict(optimizer=optimizer) for optimizer in ("sign", "adam")] if has_policies else [{}]
+    """What --optimizer may be, as arguments of `train`; Q-learning and PPO have no such option."""
+    takes_optimizer = "optimizer" in [field.name for field in fields(script(name).Args)]
+    return [dict(optimizer=optimizer) for optimizer in ("sign", "adam")] if takes_optimizer else [{}]
 
 
 each_script_and_setting = pytest.mark.parametrize(
