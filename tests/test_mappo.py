@@ -20,7 +20,7 @@ def test_critics_tell_states_apart_that_look_the_same_to_an_agent():
     assert np.array_equal(*obs)
     for module, apart in ((mappo, True), (ippo, False)):
         team = module.build(module.Args(hidden=(64, 32), episodes_per_update=1), world, [np.random.default_rng(0)])
-        team.batch.obs[:2, 0] = obs
+        team.batch.obs[:2, 0], team.batch.count[:] = obs, 2
         if module is mappo:
             team.batch.global_state[:2, 0] = states * world.state_scale
         values = team.critic(module.seen_by_critics(team.batch)[:2, 0].transpose(1, 0, 2)).detach()  # [num_agents, 2, 1]
