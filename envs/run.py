@@ -68,7 +68,7 @@ class RunArgs:
     """The arguments that every script has. `None` means the value of the script's WORLDS or TUNED."""
 
     env: str = "pushbox"
-    """world: cleaner, findtreasure, gotogether, movebox or pushbox, or a file with a world of your own such as my_world.py"""
+    """world: cleaner, climbing, findtreasure, gotogether, movebox, passage, pushbox or secretroom, or a file: my_world.py"""
     env_args: tuple[str, ...] = ()
     """options of the world, such as size=6 (envs/<world>.py lists them)"""
     seed: Annotated[int, AtLeast(0)] = 1
