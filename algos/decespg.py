@@ -47,6 +47,12 @@ TUNED = {
     ("movebox", "adam"): dict(learning_rate=3e-3, beta=0.1, slots=3),
     ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, beta=10.0, slots=10),
+    ("climbing", "sign"): dict(learning_rate=1e-3, beta=0.3, slots=10),
+    ("climbing", "adam"): dict(learning_rate=3e-3, beta=0.3, slots=10),
+    ("passage", "sign"): dict(learning_rate=1e-3, beta=0.03, slots=10),
+    ("passage", "adam"): dict(learning_rate=3e-3, beta=0.3, slots=10),
+    ("secretroom", "sign"): dict(learning_rate=1e-3, beta=0.1, slots=10),
+    ("secretroom", "adam"): dict(learning_rate=3e-3, beta=0.03, slots=10),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.1, slots=10)  # what a world of your own gets
 

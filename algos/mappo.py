@@ -49,6 +49,9 @@ TUNED = {
     ("gotogether", "adam"): dict(learning_rate=3e-3, entropy_coef=0.01),
     ("movebox", "adam"): dict(learning_rate=1e-3, entropy_coef=0.01),
     ("pushbox", "adam"): dict(learning_rate=1e-3, entropy_coef=0.03),
+    ("climbing", "adam"): dict(learning_rate=1e-3, entropy_coef=0.03),
+    ("passage", "adam"): dict(learning_rate=3e-3, entropy_coef=3e-3),
+    ("secretroom", "adam"): dict(learning_rate=3e-3, entropy_coef=3e-3),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, entropy_coef=0.01)  # what a world of your own gets
 MAX_GRAD_NORM = 10.0  # of the gradient of each network by itself (Yu et al.)

@@ -48,6 +48,12 @@ TUNED = {
     ("movebox", "adam"): dict(learning_rate=3e-4),
     ("pushbox", "sign"): dict(learning_rate=3e-4),
     ("pushbox", "adam"): dict(learning_rate=1e-3),
+    ("climbing", "sign"): dict(learning_rate=1e-3),
+    ("climbing", "adam"): dict(learning_rate=3e-3),
+    ("passage", "sign"): dict(learning_rate=1e-3),
+    ("passage", "adam"): dict(learning_rate=1e-3),
+    ("secretroom", "sign"): dict(learning_rate=1e-3),
+    ("secretroom", "adam"): dict(learning_rate=1e-3),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3)  # what a world of your own gets
 

@@ -45,6 +45,12 @@ TUNED = {
     ("movebox", "adam"): dict(learning_rate=3e-4, slots=3),
     ("pushbox", "sign"): dict(learning_rate=1e-4, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, slots=3),
+    ("climbing", "sign"): dict(learning_rate=1e-3, slots=10),
+    ("climbing", "adam"): dict(learning_rate=3e-3, slots=10),
+    ("passage", "sign"): dict(learning_rate=1e-3, slots=1),
+    ("passage", "adam"): dict(learning_rate=3e-3, slots=1),
+    ("secretroom", "sign"): dict(learning_rate=1e-3, slots=10),
+    ("secretroom", "adam"): dict(learning_rate=3e-3, slots=10),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, slots=10)  # what a world of your own gets
 
