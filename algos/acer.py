@@ -49,7 +49,7 @@ TUNED = {
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
     ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),

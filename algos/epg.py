@@ -44,7 +44,7 @@ TUNED = {
     ("cleaner", "adam"): dict(learning_rate=1e-3, beta=0.03),
     ("findtreasure", "sign"): dict(learning_rate=3e-4, beta=0.1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03),
+    ("gotogether", "sign"): dict(learning_rate=3e-4, beta=0.03),
     ("gotogether", "adam"): dict(learning_rate=1e-3, beta=0.1),
     ("movebox", "sign"): dict(learning_rate=1e-4, beta=0.03),
     ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.3),

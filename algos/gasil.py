@@ -56,7 +56,7 @@ TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=0.3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=30.0),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, lambda_im=30.0),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=1.0),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=0.3),
     ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.1, lambda_im=1.0),
     ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=10.0),
     ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.1, lambda_im=10.0),

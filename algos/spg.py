@@ -39,7 +39,7 @@ TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, slots=3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, slots=1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=3),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, slots=10),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, slots=3),
     ("gotogether", "adam"): dict(learning_rate=3e-3, slots=10),
     ("movebox", "sign"): dict(learning_rate=3e-4, slots=3),
     ("movebox", "adam"): dict(learning_rate=3e-4, slots=3),
