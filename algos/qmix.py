@@ -8,11 +8,15 @@ themselves: a mixing network, which the global state s governs and which is ther
 W1, b1, w2 linear in s and V a small network. No weight is negative, so Q_tot never falls as a Q_i rises, and the agents' own
 best actions are the team's best. Along batches of old steps all networks descend
 
-    (y - Q_tot)^2,      y = r + gamma max_a' Q'_tot, or y = r where the world has ended,       with Q'_tot an older copy
+    (y - Q_tot)^2,      y = r + gamma Q'_tot(s', best a'), or y = r where the world has ended,       with Q'_tot an older copy
 
 (Rashid et al., "QMIX: Monotonic Value Function Factorisation for Deep Multi-Agent Reinforcement Learning", ICML 2018: Eqs. 5
 and 6, Section 4). `--mixer sum` is VDN: Q_tot = sum_i Q_i (Sunehag et al., "Value-Decomposition Networks For Cooperative
 Multi-Agent Learning Based On Team Reward", AAMAS 2018). The time limit bootstraps, the end of the world does not.
+
+Which a' is best, the learning networks say and not the older copies: double Q-learning (van Hasselt et al., AAAI 2016), as in
+the authors' pymarl and unlike dqn.py. Values are too high at first even so, but with the copies' own largest value, which is
+Eq. 6 to the letter, they are more so: in findtreasure, where an episode is worth 100, up to 570 instead of 310.
 
 All scores are of play with epsilon, 0.05 in the end; that of greedy play is what `--evaluate policy.pt --greedy` says.
 
@@ -222,11 +226,12 @@ def of_team(values, num_trials):
 
 
 def squared_td_errors(policy, mixer, target, target_mixer, batch, gamma):
-    """As in dqn.py, but of Q_tot: the target mixes the agents' largest values, which is the largest Q'_tot (Eq. 6)."""
+    """As in dqn.py, but of Q_tot, with y = r + gamma Q'_tot(s', a') for the a' that are best by Q_i (Eq. 6, with double Q)."""
     obs, actions, next_obs, state, next_state, reward, terminated = batch
     with torch.no_grad():
-        best = of_team(target(next_obs).amax(-1), len(state))
-        y = reward + gamma * (1 - terminated) * target_mixer(best, next_state)
+        best = policy(next_obs).argmax(-1, keepdim=True)
+        following = of_team(target(next_obs).gather(-1, best)[..., 0], len(state))
+        y = reward + gamma * (1 - terminated) * target_mixer(following, next_state)
     taken = of_team(policy(obs).gather(-1, actions[..., None])[..., 0], len(state))
     return (y - mixer(taken, state)).square()
 

@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 from itertools import groupby, product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -164,8 +165,9 @@ def q_values(own, obs):
 def plain_error(own, own_mixer, target, target_mixer, step, gamma):
     """(y - Q_tot)^2 of one step of one team, with gradient; the weights of the mixers are () for a sum."""
     obs, actions, next_obs, state, next_state, reward, terminated = step
-    best = [max(values).item() for values in q_values(target, next_obs)]
-    rest = plain_mix(target_mixer, best, next_state).item() if target_mixer else sum(best)
+    best = [values.argmax() for values in q_values(own, next_obs)]
+    rest = [values[a].item() for values, a in zip(q_values(target, next_obs), best, strict=True)]
+    rest = plain_mix(target_mixer, rest, next_state).item() if target_mixer else sum(rest)
     taken = [values[a] for values, a in zip(q_values(own, obs), actions, strict=True)]
     total = plain_mix(own_mixer, taken, state) if own_mixer else sum(taken)
     return (float(reward) + (0 if terminated else gamma * rest) - total) ** 2
@@ -347,7 +349,15 @@ class Walk(envs.World):
     step, observe = staticmethod(walk), staticmethod(envs.base.observe_positions)
 
 
-def test_the_sum_of_one_agent_is_dqn(tmp_path, monkeypatch):
+def test_the_sum_of_one_agent_is_dqn_with_double_q(tmp_path, monkeypatch):
+    def double_errors(policy, target, batch, gamma):
+        """As in dqn.py, but the value in the target is that of the action which `policy` prefers."""
+        preferred = SimpleNamespace(amax=lambda _: following)
+        following = target(batch[2]).gather(-1, policy(batch[2]).argmax(-1, keepdim=True))[..., 0]
+        return plain_errors(policy, lambda _: preferred, batch, gamma)
+
+    plain_errors = dqn.squared_td_errors
+    monkeypatch.setattr(dqn, "squared_td_errors", double_errors)
     world = Walk(np.array([4]), [0], [[0]], num_agents=1, obs_dim=1, cell=0.25, state_scale=[0.25], max_steps=30)
     args = dict(env="walk", hidden=(16,), gamma=0.9, exploration=0.5, learning_rate=3e-3, num_episodes=60, num_trials=2)
     runs = {}
