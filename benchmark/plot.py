@@ -105,8 +105,9 @@ def compare(one, other):
 def draw(groups, path):
     """A panel for each world."""
     worlds = list(dict.fromkeys(group.world for group in groups))
-    figure, axes = plt.subplots(1, len(worlds), figsize=(4.6 * len(worlds) + 2, 3.6), layout="constrained", squeeze=False)
     labels = list(dict.fromkeys(group.label for group in groups))
+    size = (4.6 * len(worlds) + 2, 3.2 + 0.22 * len(labels))  # the panels and, below them, a line for each curve
+    figure, axes = plt.subplots(1, len(worlds), figsize=size, layout="constrained", squeeze=False)
     for axis, world in zip(axes[0], worlds, strict=True):
         there = [group for group in groups if group.world == world]
         block = max(1, max(group.score.shape[1] for group in there) // POINTS)
