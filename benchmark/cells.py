@@ -44,8 +44,9 @@ METHODS = {
     "espg_emi": "ESPG+EMI",
     "gasil": "GASIL",
 }
-# Beyond the paper, under a heading of their own.
+# Beyond the paper, under a heading of their own, and those of the paper that stand beside them there.
 BEYOND = {"hysteretic": "Hysteretic DQN", "ippo": "IPPO", "mappo": "MAPPO", "qmix": "QMIX"}
+BESIDE = ("pg", "spg", "decespg", "coma", "dqn", "edti")
 
 
 def name_of(method):

@@ -7,7 +7,7 @@ import numpy as np
 
 import envs
 from benchmark import measures
-from benchmark.cells import OPTIMIZERS, WORLDS, name_of
+from benchmark.cells import BESIDE, BEYOND, OPTIMIZERS, WORLDS, name_of
 from benchmark.results import block_of, named_in
 from envs.drawing import AGENTS
 
@@ -41,7 +41,7 @@ FIGURES = {
     "figure3": ("pg", "ac", "coma", "acer", "dqn", "edti", "espg", "decespg"),
     "figure4": ("pg", "epg", "spg", "espg", "decespg"),
     "figure6": ("decespg_ex2", "espg_icm", "espg_emi", "gasil", "espg", "decespg"),
-    "beyond": ("pg", "coma", "dqn", "edti", "hysteretic", "qmix", "ippo", "mappo", "spg", "decespg"),
+    "beyond": (*BESIDE, *BEYOND),
 }
 
 

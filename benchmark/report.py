@@ -24,7 +24,7 @@ from matplotlib import pyplot as plt
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark import figures, measures, results
-from benchmark.cells import METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, seeds_of, select
+from benchmark.cells import BEYOND, BEYOND_WORLDS, METHODS, OPTIMIZERS, ROOT, RUNS, WORLDS, name_of, script, seeds_of, select
 from envs.command import command_line
 
 README, DOCS = ROOT / "README.md", ROOT / "docs"
@@ -148,10 +148,9 @@ def cell_table(found):
 def settings_table():
     """What the tuning rule has chosen: the method's numbers in each world, under each optimiser."""
     rows = [["method", "world", *OPTIMIZERS]]
-    for method in METHODS:
-        tuned = script(method).TUNED
-        for world in WORLDS:
-            chosen = [tuned.get((world, optimizer), {}) for optimizer in OPTIMIZERS]
+    for method, world in product(METHODS | BEYOND, (*WORLDS, *BEYOND_WORLDS)):
+        chosen = [script(method).TUNED.get((world, optimizer), {}) for optimizer in OPTIMIZERS]
+        if any(chosen):
             rows.append([name_of(method), world, *(", ".join(f"{k} {v:g}" for k, v in numbers.items()) for numbers in chosen)])
     return rows
 

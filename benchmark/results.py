@@ -11,6 +11,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark.cells import (
+    BESIDE,
     BEYOND,
     BEYOND_WORLDS,
     METHODS,
@@ -207,9 +208,9 @@ def of_the_paper(found):
 
 
 def beyond_the_paper(found):
-    """The results of all worlds in which there is one that is not `of_the_paper`, without anybody's own methods."""
+    """The results beyond the paper, and those of its methods that stand beside them in the same worlds."""
     worlds = {world for world, method, _ in found if world in BEYOND_WORLDS or method in BEYOND}
-    return {key: result for key, result in found.items() if key[0] in worlds and key[1] in METHODS | BEYOND}
+    return {key: result for key, result in found.items() if key[0] in worlds and key[1] in (*BESIDE, *BEYOND)}
 
 
 def seconds_per_episode(results):

@@ -18,7 +18,8 @@ from tqdm import tqdm
 from envs.base import UsageError, World, check_memory
 from envs.statistics import reward_per_step
 
-MAX_STATES = 3_000_000
+MAX_STATES, MAX_JOINT = 3_000_000, 10_000  # of states and of joint actions in each
+MAX_STEPS = 100_000_000  # of states times joint actions: 1.2 GB
 AT_ONCE = 10**8  # states times actions times steps between two looks of the bar and of Ctrl-C: under a second
 PATIENCE = 2  # seconds without a bar
 CHOICES = 25_000_000  # actions of states that a backward pass keeps at a time: 100 MB
@@ -59,7 +60,7 @@ class Optimum:
 
 
 def find_optimum(world: World) -> Optimum:
-    """The optimum of `world` within its max_steps; UsageError if it has more than MAX_STATES states or needs too much memory.
+    """The optimum of `world` within its max_steps; UsageError if it has too many states or actions or needs too much memory.
 
     Time and memory are about 10 s and 0.5 GB for a million states with 16 joint actions. Where a long time limit takes more
     than some seconds, a bar on stderr says how far it is. A world that says that it is not searchable gives the episode of its
@@ -118,12 +119,16 @@ def fits(world, episode):
 
 
 def explored(world):
-    """All joint actions [J, num_agents], and what `explore` finds with them; UsageError if there are more than MAX_STATES."""
-    check_memory(f"all joint actions of {world.num_agents} agents", 100 * world.num_actions**world.num_agents)
+    """All joint actions [J, num_agents], and what `explore` finds with them; UsageError if there is too much to search."""
+    num_joint = world.num_actions**world.num_agents
+    if num_joint > MAX_JOINT:
+        raise UsageError(f"only worlds of at most {MAX_JOINT} joint actions can be searched, and this {world.name} has more.")
     joint = np.array(list(product(range(world.num_actions), repeat=world.num_agents)))
-    following, reward = compile_explore(world.step)(world.rules, world.start, joint, MAX_STATES)
-    if len(following) > MAX_STATES:
-        raise UsageError(f"only worlds of at most {MAX_STATES} states can be searched, and this {world.name} has more.")
+    limit = min(MAX_STATES, MAX_STEPS // num_joint)
+    following, reward = compile_explore(world.step)(world.rules, world.start, joint, limit)
+    if len(following) > limit:
+        said = f"{limit} states, with {num_joint} joint actions in each,"
+        raise UsageError(f"only worlds of at most {said} can be searched, and this {world.name} has more.")
     return joint, following, reward
 
 

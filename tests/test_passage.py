@@ -18,8 +18,7 @@ WORLD = envs.make_world("passage")
 @pytest.mark.parametrize("recording", ["passage", "passage30"])
 def test_recorded_episodes(recording):
     """Of pass_environment.py in TonghanWang/EITI-EDTI, from its fixed start; its rewards, divided by ten."""
-    options = {option: RECORDED[recording][option] for option in ("size", "door_stays", "max_steps")}
-    assert_replays(recording, lambda positions: [*positions[0], *positions[1]], **options)
+    assert_replays(recording, lambda positions: [*positions[0], *positions[1]], **RECORDED[recording]["options"])
 
 
 @pytest.mark.parametrize(("action", "target"), [(UP, [4, 3]), (DOWN, [6, 3]), (LEFT, [5, 2]), (RIGHT, [5, 4])])

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import envs
+from benchmark import cells
 from envs import run
 from tests.helpers import (
     ALGOS,
@@ -71,8 +72,6 @@ PAPER = (
     "espg_emi",
     "gasil",
 )
-
-PAPER_WORLDS = ("cleaner", "findtreasure", "gotogether", "movebox", "pushbox")
 
 # --- the copies ---
 
@@ -196,7 +195,7 @@ def test_every_world_and_optimiser_has_its_defaults(name):
             assert None not in [value for field, value in vars(args).items() if field != "evaluate"]
             assert args.hidden == module.WORLDS[world]["hidden"]
             pair = world, choice.get("optimizer", "adam")
-            tuned = module.TUNED[pair] if world in PAPER_WORLDS else module.TUNED.get(pair, module.OTHER)
+            tuned = module.TUNED[pair] if world in cells.WORLDS else module.TUNED.get(pair, module.OTHER)
             assert args.learning_rate == tuned["learning_rate"]
 
 

@@ -197,6 +197,14 @@ def test_worlds_with_too_many_states_are_refused(monkeypatch):
     assert_refused("at most 327 states", envs.optimum, "findtreasure")
 
 
+def test_too_many_agents_are_refused_before_their_joint_actions_are_made(monkeypatch):
+    assert_refused("at most 10000 joint actions", envs.optimum, "gotogether", size=1001, num_agents=999)
+    monkeypatch.setattr("envs.search.MAX_STEPS", 7800 * 125)
+    assert envs.optimum("findtreasure", num_agents=3).num_states == 7800
+    monkeypatch.setattr("envs.search.MAX_STEPS", 7800 * 125 - 1)
+    assert_refused("at most 7799 states", envs.optimum, "findtreasure", num_agents=3)
+
+
 def test_a_time_limit_beyond_memory_is_refused():
     for name in ("findtreasure", "cleaner"):
         assert_refused("a table of 2000000000 steps would need", envs.optimum, name, max_steps=2_000_000_000)

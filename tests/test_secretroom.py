@@ -17,8 +17,7 @@ WORLD = envs.make_world("secretroom")
 @pytest.mark.parametrize("recording", ["secretroom", "secretroom30"])
 def test_recorded_episodes(recording):
     """Of three_pass_environment.py in TonghanWang/EITI-EDTI, from its fixed start; its rewards, divided by ten."""
-    options = {option: RECORDED[recording][option] for option in ("size", "door_stays", "max_steps")}
-    assert_replays(recording, lambda positions: [*positions[0], *positions[1]], **options)
+    assert_replays(recording, lambda positions: [*positions[0], *positions[1]], **RECORDED[recording]["options"])
 
 
 @pytest.mark.parametrize(
