@@ -306,18 +306,18 @@ def test_the_optimiser_is_torchs_adam_for_each_trial_by_its_own_count():
 # --- whole runs ---
 
 
-def record_updates(monkeypatch):
+def record_updates(monkeypatch, module=dqn):
     """A list that gets every `Update` that the script makes from now on."""
-    updates, rollouts = [], record_rollouts(dqn, monkeypatch)
+    updates, rollouts = [], record_rollouts(module, monkeypatch)
 
-    class WatchedAdam(dqn.MaskedAdam):
+    class WatchedAdam(module.MaskedAdam):
         def step(self, loss, active):
             grads = torch.autograd.grad(loss, self.weights, retain_graph=True)
             params = [param.detach().clone() for param in self.weights]
             updates.append(Update(rollouts[-1], params, [-grad for grad in grads]))
             super().step(loss, active)
 
-    monkeypatch.setattr(dqn, "MaskedAdam", WatchedAdam)
+    monkeypatch.setattr(module, "MaskedAdam", WatchedAdam)
     return updates
 
 
@@ -334,13 +334,16 @@ class PlainTrial:
         before = self.count
         for t in range(rollout.lengths[k]):
             terminated = t + 1 == rollout.lengths[k] and rollout.outcomes[k] > 0
-            step = rollout.all_obs[t, k], rollout.actions[t, k], rollout.reward[t, k, 0], rollout.all_obs[t + 1, k], terminated
             row = self.count % self.size
-            self.ring[row : row + 1] = [step]  # appends until the ring is full
+            self.ring[row : row + 1] = [self.kept(rollout, t, k, terminated)]  # appends until the ring is full
             self.count += 1
         due, copied = (self.count // every - before // every for every in (self.train_every, self.target_every))
         rows = self.learn.integers(len(self.ring), size=(due, self.batch_size))
         return [[self.ring[row] for row in batch] for batch in rows], copied > 0
+
+    def kept(self, rollout, t, k, terminated):
+        """What it keeps of a step."""
+        return rollout.all_obs[t, k], rollout.actions[t, k], rollout.reward[t, k, 0], rollout.all_obs[t + 1, k], terminated
 
 
 def plain_descent(params, target, agent, batch, gamma):

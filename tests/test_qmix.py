@@ -10,18 +10,16 @@ import torch
 
 import envs
 from algos import dqn, qmix
+from tests import test_dqn
 from tests.helpers import (
     RACE,
-    Update,
     assert_same_run,
     curves,
     plain_logits,
-    record_rollouts,
     train,
     use_double_precision,
     weights,
 )
-from tests.test_dqn import Loop
 from tests.test_pg import generators
 
 TWO_STEP = RACE.with_name("two_step.py")
@@ -221,7 +219,7 @@ def test_the_time_limit_bootstraps_and_an_end_does_not(kind, ends, expected, tmp
 
     The state, which counts the steps and so tells the last one, is kept from the mixer.
     """
-    world = Loop(np.array([ends]), [0], [[0], [0]], num_agents=2, obs_dim=1, cell=1.0, state_scale=[0.0], max_steps=5)
+    world = test_dqn.Loop(np.array([ends]), [0], [[0], [0]], num_agents=2, obs_dim=1, cell=1.0, state_scale=[0.0], max_steps=5)
     monkeypatch.setattr(qmix, "resolve", lambda args, *_: (args, world))
     args = dict(env="loop", hidden=(16,), gamma=0.9, exploration=1.0, learning_rate=1e-3, num_episodes=300, mixer=kind)
     team = train(qmix, tmp_path, **args, train_every=1, target_every=20, batch_size=500, buffer_size=500)
@@ -233,42 +231,13 @@ def test_the_time_limit_bootstraps_and_an_end_does_not(kind, ends, expected, tmp
 # --- whole runs ---
 
 
-def record_updates(monkeypatch):
-    """A list that gets every `Update` that the script makes from now on."""
-    updates, rollouts = [], record_rollouts(qmix, monkeypatch)
+class PlainTrial(test_dqn.PlainTrial):
+    """As in test_dqn.py, but a step is kept with its states."""
 
-    class WatchedAdam(qmix.MaskedAdam):
-        def step(self, loss, active):
-            grads = torch.autograd.grad(loss, self.weights, retain_graph=True)
-            params = [param.detach().clone() for param in self.weights]
-            updates.append(Update(rollouts[-1], params, [-grad for grad in grads]))
-            super().step(loss, active)
-
-    monkeypatch.setattr(qmix, "MaskedAdam", WatchedAdam)
-    return updates
-
-
-class PlainTrial:
-    """What one trial keeps, draws and copies, with lists and its own generator; `target` are the weights of its targets."""
-
-    def __init__(self, seed, target, size, batch_size, train_every, target_every):
-        self.learn = np.random.default_rng(np.random.SeedSequence(seed).spawn(3)[2])
-        self.target, self.ring, self.count = target, [], 0
-        self.size, self.batch_size, self.train_every, self.target_every = size, batch_size, train_every, target_every
-
-    def play(self, rollout, k):
-        """Keep trial k's episode; returns the batches that are due then, and whether the target is to be copied after them."""
-        before = self.count
-        for t in range(rollout.lengths[k]):
-            terminated = t + 1 == rollout.lengths[k] and rollout.outcomes[k] > 0
-            seen = rollout.all_obs[t, k], rollout.actions[t, k], rollout.all_obs[t + 1, k]
-            states = rollout.global_state[t, k], rollout.global_state[t + 1, k]
-            row = self.count % self.size
-            self.ring[row : row + 1] = [(*seen, *states, rollout.reward[t, k, 0] / 10, terminated)]  # appends until it is full
-            self.count += 1
-        due, copied = (self.count // every - before // every for every in (self.train_every, self.target_every))
-        rows = self.learn.integers(len(self.ring), size=(due, self.batch_size))
-        return [[self.ring[row] for row in batch] for batch in rows], copied > 0
+    def kept(self, rollout, t, k, terminated):
+        seen = rollout.all_obs[t, k], rollout.actions[t, k], rollout.all_obs[t + 1, k]
+        states = rollout.global_state[t, k], rollout.global_state[t + 1, k]
+        return *seen, *states, rollout.reward[t, k, 0] / 10, terminated
 
 
 def of_trial(params, k):
@@ -288,7 +257,7 @@ def test_every_update_descends_the_mean_squared_error_of_its_batch(kind, tmp_pat
     use_double_precision(qmix, monkeypatch)
     monkeypatch.setattr(qmix, "MIXING_UNITS", 3)
     monkeypatch.setitem(globals(), "UNITS", 3)
-    updates = record_updates(monkeypatch)
+    updates = test_dqn.record_updates(monkeypatch, qmix)
     every = dict(batch_size=3, train_every=3, target_every=20)
     args = dict(env="findtreasure", seed=4, num_trials=3, num_episodes=9, max_steps=9, learning_rate=0.05, gamma=0.9)
     args |= dict(hidden=(6,), exploration=0.5, log_every=1, mixer=kind)
