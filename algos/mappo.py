@@ -279,7 +279,7 @@ def build(args, world, init):
         policy=StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions]),
         critic=StackedMLP(init, world.num_agents, [len(world.start) + world.obs_dim, *args.hidden, 1]),
         normalizer=ValueNormalizer(len(init), world.num_agents),
-        batch=EpisodeBatch(world, len(init), args.episodes_per_update),
+        batch=EpisodeBatch(world, len(init), min(args.episodes_per_update, args.num_episodes)),
         figures=SimpleNamespace(state=[np.zeros((5, len(init)))]),  # of the last update, shown until the next
     )
 

@@ -32,6 +32,7 @@ from matplotlib import pyplot as plt
 POINTS = 100  # of the longest curve in a panel
 RESAMPLES = 2000  # of the bootstrap
 FEWEST = 5  # trials that have an interval
+TASK = ("env_args", "max_steps")  # settings that make another task of a world, for all methods
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,9 @@ def groups_of(found):
     settings = [json.loads(text) for text in found]
     groups = []
     for own, trials in zip(settings, found.values(), strict=True):
-        others = [other for other in settings if (other["method"], other["env"]) == (own["method"], own["env"])]
-        names = [name for name in own if any(other.get(name) != own[name] for other in others)]
+        there = [other for other in settings if other["env"] == own["env"]]
+        alike = [other for other in there if other["method"] == own["method"]]
+        names = [name for name in own if any(other.get(name) != own[name] for other in (there if name in TASK else alike))]
         values = [" ".join(map(str, own[name])) if isinstance(own[name], list) else own[name] for name in names]
         words = [f"{name}={value}" for name, value in zip(names, values, strict=True)]
         seeds = tuple(sorted(trials))

@@ -163,9 +163,11 @@ def versions(found):
 
 
 def time_needed(found, cores=2):
-    """How long all cells take at Table 1's episodes, by the kept times; only of worlds in which there are some."""
+    """How long all cells take at Table 1's episodes, by the kept times; only of the paper's worlds in which there are some."""
     pace = results.seconds_per_episode(found)
     worlds = [world for world in WORLDS if any(w == world and result.seconds > 0 for (w, *_), result in found.items())]
+    if not worlds:
+        return ""
     cells = select(METHODS, worlds, OPTIMIZERS)
     hours = sum(pace[cell.method, cell.world] * cell.settings["num_episodes"] for cell in cells) / 3600 / cores
     return f"All cells of {', '.join(worlds)} at Table 1's episodes take about {hours:.1f} hours on {cores} cores."
@@ -342,7 +344,7 @@ def main(args: Args):
         publish(found, drawn)
     plt.close("all")
     print(markdown(score_table(found)), markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")
-    print(f"\n{time_needed(found)} See {output_dir}.")
+    print("", f"{time_needed(found)} See {output_dir}.".strip(), sep="\n")
 
 
 if __name__ == "__main__":

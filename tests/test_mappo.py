@@ -15,7 +15,7 @@ def test_critics_tell_states_apart_that_look_the_same_to_an_agent():
     obs = np.array([look(world, state) for state in states], np.float32)
     assert np.array_equal(*obs)
     for module, apart in ((mappo, True), (ippo, False)):
-        team = module.build(module.Args(hidden=(64, 32), episodes_per_update=1), world, [np.random.default_rng(0)])
+        team = module.build(module.Args(hidden=(64, 32), num_episodes=1), world, [np.random.default_rng(0)])
         team.batch.obs[:2, 0], team.batch.count[:] = obs, 2
         if module is mappo:
             team.batch.global_state[:2, 0] = states * world.state_scale

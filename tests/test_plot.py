@@ -40,6 +40,13 @@ def test_runs_that_differ_in_their_seeds_are_one_curve(runs):
     assert one.last == pytest.approx(one.score[:, -3:].mean(1))
 
 
+def test_another_task_is_named_beside_another_method():
+    settings = dict(method="pg", env="gotogether", env_args=[], max_steps=200, hidden=[64])
+    others = settings | dict(method="mappo", env_args=["size=7", "num_agents=3"], hidden=[32])
+    found = {plot.json.dumps(each): {1: np.zeros(10)} for each in (settings, others)}
+    assert [group.label for group in plot.groups_of(found)] == ["pg env_args=", "mappo env_args=size=7 num_agents=3"]
+
+
 def test_differences_are_those_of_the_same_seeds():
     noise = np.random.default_rng(0).normal(scale=100, size=(20, 1))
     one, other = (Group("", "pushbox", tuple(range(20)), noise + shift) for shift in (2.0, 0.0))
