@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import sys
+from math import log
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -151,16 +152,43 @@ def test_the_example_of_a_search_trains_with_what_is_chosen(tmp_path, monkeypatc
     assert 0.3 < results[0] < 2
 
 
-def test_the_example_of_a_bonus_takes_the_place_of_the_window(folder, tmp_path):
-    bonus = example("class VisitNovelty")
+def put_in_the_place_of_the_window(bonus, folder):
+    """Make folder/algos/counts.py, decespg.py with another bonus."""
     script = (ROOT / "algos" / "decespg.py").read_text(encoding="utf-8")
     changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: bonus + "\n\n", script, flags=re.DOTALL)
     changed = changed.replace("import numpy as np\n", "from collections import defaultdict\n\nimport numpy as np\n", 1)
     assert changed.count("class VisitNovelty") == 1
-    (tmp_path / "algos").mkdir()
-    (tmp_path / "algos" / "counts.py").write_text(changed)
-    (tmp_path / "envs").symlink_to(ROOT / "envs")
+    (folder / "algos").mkdir()
+    (folder / "algos" / "counts.py").write_text(changed)
+    (folder / "envs").symlink_to(ROOT / "envs")
+
+
+def test_the_example_of_a_bonus_takes_the_place_of_the_window(tmp_path):
+    put_in_the_place_of_the_window(example("1 / sqrt(n) for the n-th visit"), tmp_path)
     train = "import sys; sys.path.insert(0, 'algos'); import counts; run = counts.train(counts.Args(num_episodes=30));"
     said = python(tmp_path, "-c", train + "print(sum(run.novelty.counts.values()), 2 * run.log.lengths.sum())")
     remembered, steps = map(int, said.splitlines()[-1].split())
     assert remembered == steps > 60
+
+
+def test_the_window_of_all_visits_counts_them(tmp_path):
+    put_in_the_place_of_the_window(example("def visits_before"), tmp_path)
+    code = """
+import sys; sys.path.insert(0, "algos")
+import counts, numpy as np
+run = counts.train(counts.Args(env="movebox", num_trials=2, num_episodes=3, beta=100, noise=10))
+print(run.novelty.counts.sum(), 2 * run.log.lengths.sum())
+pairs = np.zeros((7, 2, 2, 10), np.float32)  # the agents stand beside the box all the time, and choose up but for once
+pairs[..., 4:] = np.array([10, 6, 10, 8, 10, 7]) / 15
+pairs[..., 0] = 1
+pairs[2, ..., :4] = 0, 0, 0, 1
+novelty = counts.VisitNovelty(2, 2, 10, 50, 0.5, 10.0)
+bonus, _, _ = novelty.bonus(pairs, np.array([5, 7]))
+print(*bonus[:, 0, 0], *bonus[:, 1, 1])
+"""
+    counts, bonuses = python(tmp_path, "-c", code).splitlines()[-2:]
+    remembered, steps = map(int, counts.split())
+    assert remembered == steps > 60
+    first = log(1000)
+    five = [first, log(1 + 10 / 1), first, log(1 + 10 / 2), log(1 + 10 / 3)]
+    assert list(map(float, bonuses.split())) == pytest.approx([*five, 0, 0, *five, log(1 + 10 / 4), log(1 + 10 / 5)])
