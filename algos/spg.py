@@ -42,7 +42,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=1e-3, slots=3),
     ("gotogether", "adam"): dict(learning_rate=3e-3, slots=10),
     ("movebox", "sign"): dict(learning_rate=3e-4, slots=3),
-    ("movebox", "adam"): dict(learning_rate=3e-4, slots=3),
+    ("movebox", "adam"): dict(learning_rate=3e-3, slots=1),
     ("pushbox", "sign"): dict(learning_rate=1e-4, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, slots=3),
     ("climbing", "sign"): dict(learning_rate=1e-3, slots=10),
