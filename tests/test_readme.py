@@ -187,8 +187,9 @@ novelty = counts.VisitNovelty(2, 2, 10, 50, 0.5, 10.0)
 bonus, _, _ = novelty.bonus(pairs, np.array([5, 7]))
 print(*bonus[:, 0, 0], *bonus[:, 1, 1])
 """
-    (command,) = [command for command in COMMANDS if "counts.py" in command]
-    assert "20 trials" in python(tmp_path, *command.split()[1:], "--num-episodes", 2)
+    reported, chosen = [command for command in COMMANDS if "counts.py" in command]
+    for command, trials in ((reported, "20 trials"), (chosen, " 5 trials")):
+        assert trials in python(tmp_path, *command.split()[1:], "--num-episodes", 2)
     counts, bonuses = python(tmp_path, "-c", code).splitlines()[-2:]
     remembered, steps = map(int, counts.split())
     assert remembered == steps > 60
