@@ -45,13 +45,13 @@ WORLDS = {
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/acer.csv); guesses where it has no row yet.
 TUNED = {
-    ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
+    ("cleaner", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
-    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
+    ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
