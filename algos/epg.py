@@ -45,7 +45,7 @@ TUNED = {
     ("findtreasure", "sign"): dict(learning_rate=3e-4, beta=0.1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("gotogether", "sign"): dict(learning_rate=3e-4, beta=0.03),
-    ("gotogether", "adam"): dict(learning_rate=1e-3, beta=0.1),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("movebox", "sign"): dict(learning_rate=1e-4, beta=0.03),
     ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.3),
     ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0),

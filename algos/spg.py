@@ -40,7 +40,7 @@ TUNED = {
     ("findtreasure", "sign"): dict(learning_rate=1e-3, slots=1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, slots=3),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, slots=10),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, slots=1),
     ("movebox", "sign"): dict(learning_rate=3e-4, slots=3),
     ("movebox", "adam"): dict(learning_rate=3e-3, slots=1),
     ("pushbox", "sign"): dict(learning_rate=1e-4, slots=10),
