@@ -50,7 +50,7 @@ TUNED = {
     ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=1e-3),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-4),
     ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-3),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
