@@ -76,7 +76,7 @@ class Args(RunArgs):
     noise: Annotated[float, AtLeast(1e-6)] = 0.01
     """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes that the memory keeps for each terminal state, 0: none (None: tuned for world and optimiser; 10 in others)"""
+    """episodes that the memory keeps for each terminal state, 0: none (None: 3 in cleaner and movebox, 10 elsewhere)"""
 
 
 class StackedMLP:
@@ -119,11 +119,13 @@ def slide_inverse(inverse, product, kernel, slot, full, diagonal):
     """Bring inverse = (K + noise I)^-1 [m, m] up to date, in place, when a new visit takes row `slot` of the ring.
 
     kernel [m] holds the new visit's kernel values (0 where nothing is remembered), product = inverse @ kernel, and diagonal is
-    1 + noise. Eqs. 12-13 number the rows from the oldest to the newest; in a ring the newest takes the row of the oldest.
+    1 + noise; kernel and product are used up. Rows that nothing has taken yet are 0. Eqs. 12-13 number the rows from the oldest
+    to the newest; in a ring the newest takes the row of the oldest.
     """
     m = len(kernel)
     # B = H - f f^T / e (Eq. 13) is the inverse without the visit that stood in `slot`: its row is [.., e, ..] with f around e.
-    # Before the ring is full nothing stood there, B is the old inverse, and what follows is Eq. 11 with its e, g for B h, s.
+    # Before the ring is full nothing stood there: its row is 0, B is the old inverse, and what follows is Eq. 11, whose
+    # vector e is B h here and whose scalar g is s.
     row, per_e = inverse[slot].copy(), 1.0 / inverse[slot, slot] if full else 0.0
     for c in range(m):
         product[c] -= kernel[slot] * row[c]
@@ -136,10 +138,10 @@ def slide_inverse(inverse, product, kernel, slot, full, diagonal):
     s = 1.0 / s
     # B + s (B h)(B h)^T, bordered by -s B h and s.
     for r in range(m):
-        gain, loss = s * product[r], per_e * row[r]
-        if gain != 0.0 or loss != 0.0:
+        added, removed = s * product[r], per_e * row[r]
+        if added != 0.0 or removed != 0.0:
             for c in range(m):
-                inverse[r, c] += gain * product[c] - loss * row[c]
+                inverse[r, c] += added * product[c] - removed * row[c]
     for c in range(m):
         inverse[slot, c] = inverse[c, slot] = -s * product[c]
     inverse[slot, slot] = s
@@ -250,7 +252,7 @@ class SelectiveMemory:
         """The second term of Eq. 16, sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j, as weights of log pi(a | o).
 
         g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed, which Eq. 16
-        does not say; but shares of a sum that may be 0 or negative are none. Every distinct observation is there once:
+        does not say; but of a sum that is 0 or negative there are no shares. Every distinct observation is there once:
         obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
         What is stored does not change, so the steps are merged again only when a better episode has come.
         """

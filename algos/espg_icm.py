@@ -79,7 +79,7 @@ class Args(RunArgs):
     icm_hidden: Annotated[tuple[int, ...], AtLeast(1)] = (64,)
     """widths of the hidden layers of the inverse and the forward model (those of phi: --hidden)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes that the memory keeps for each terminal state, 0: none (None: tuned for world and optimiser; 10 in others)"""
+    """episodes that the memory keeps for each terminal state, 0: none (None: 3 in cleaner and movebox, 10 elsewhere)"""
 
 
 class StackedMLP:
@@ -212,7 +212,7 @@ class SelectiveMemory:
         """The second term of Eq. 16, sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j, as weights of log pi(a | o).
 
         g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed, which Eq. 16
-        does not say; but shares of a sum that may be 0 or negative are none. Every distinct observation is there once:
+        does not say; but of a sum that is 0 or negative there are no shares. Every distinct observation is there once:
         obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
         What is stored does not change, so the steps are merged again only when a better episode has come.
         """

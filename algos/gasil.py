@@ -153,11 +153,13 @@ def slide_inverse(inverse, product, kernel, slot, full, diagonal):
     """Bring inverse = (K + noise I)^-1 [m, m] up to date, in place, when a new visit takes row `slot` of the ring.
 
     kernel [m] holds the new visit's kernel values (0 where nothing is remembered), product = inverse @ kernel, and diagonal is
-    1 + noise. Eqs. 12-13 number the rows from the oldest to the newest; in a ring the newest takes the row of the oldest.
+    1 + noise; kernel and product are used up. Rows that nothing has taken yet are 0. Eqs. 12-13 number the rows from the oldest
+    to the newest; in a ring the newest takes the row of the oldest.
     """
     m = len(kernel)
     # B = H - f f^T / e (Eq. 13) is the inverse without the visit that stood in `slot`: its row is [.., e, ..] with f around e.
-    # Before the ring is full nothing stood there, B is the old inverse, and what follows is Eq. 11 with its e, g for B h, s.
+    # Before the ring is full nothing stood there: its row is 0, B is the old inverse, and what follows is Eq. 11, whose
+    # vector e is B h here and whose scalar g is s.
     row, per_e = inverse[slot].copy(), 1.0 / inverse[slot, slot] if full else 0.0
     for c in range(m):
         product[c] -= kernel[slot] * row[c]
@@ -170,10 +172,10 @@ def slide_inverse(inverse, product, kernel, slot, full, diagonal):
     s = 1.0 / s
     # B + s (B h)(B h)^T, bordered by -s B h and s.
     for r in range(m):
-        gain, loss = s * product[r], per_e * row[r]
-        if gain != 0.0 or loss != 0.0:
+        added, removed = s * product[r], per_e * row[r]
+        if added != 0.0 or removed != 0.0:
             for c in range(m):
-                inverse[r, c] += gain * product[c] - loss * row[c]
+                inverse[r, c] += added * product[c] - removed * row[c]
     for c in range(m):
         inverse[slot, c] = inverse[c, slot] = -s * product[c]
     inverse[slot, slot] = s

@@ -488,9 +488,9 @@ SENTENCES = (
         lambda f: f["decespg"] == f["espg_icm"] == f["gasil"] == 20,
     ),
     Sentence(
-        "Learnt novelty does as well in FindTreasure; in PushBox the large box is kept with EX2 in {decespg_ex2_sign} (sign) "
-        "and {decespg_ex2_adam} (Adam) trials, ICM {espg_icm_sign} and {espg_icm_adam}, EMI {espg_emi_sign} and "
-        "{espg_emi_adam}, GASIL {gasil_sign} and {gasil_adam}, the Gaussian process in all (DecESPG, ESPG).",
+        "Learnt novelty does as well in FindTreasure; in PushBox EX2 keeps the large box in {decespg_ex2_sign} (sign) and "
+        "{decespg_ex2_adam} (Adam) trials, ICM {espg_icm_sign} and {espg_icm_adam}, EMI {espg_emi_sign} and {espg_emi_adam}, "
+        "GASIL {gasil_sign} and {gasil_adam}, the Gaussian process all.",
         learnt_novelty,
         lambda f: {f[f"{m}_{o}"] for m in OURS for o in OPTIMIZERS} == {20},
     ),

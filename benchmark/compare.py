@@ -152,10 +152,12 @@ class Job:
             resume = (cell.run_dir / "checkpoint.pt").exists() and not cell.broken
             command = [*cell.command, "--checkpoint-every", str(self.checkpoint_every)]
             command.append("--resume" if resume else "--overwrite")
-            one_thread = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+            told = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+            # A script may stand anywhere, and finds envs/ all the same.
+            told["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
             with cell.log.open("ab" if resume else "wb") as log:
                 # The script inherits the lock: should this runner die, nobody else starts the cell while the script goes on.
-                kinds = dict(stdout=log, stderr=log, cwd=ROOT, env={**os.environ, **one_thread}, pass_fds=[lock.fileno()])
+                kinds = dict(stdout=log, stderr=log, cwd=ROOT, env={**os.environ, **told}, pass_fds=[lock.fileno()])
                 self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **kinds)
             self.code = self.process.wait()
             self.seconds = time.monotonic() - start
@@ -177,7 +179,8 @@ class Runner:
     def __init__(self, cells, jobs, checkpoint_every):
         cells = sorted(cells, key=lambda cell: -remaining_seconds(cell, progress(cell)))
         self.waiting = [Job(cell, checkpoint_every) for cell in cells]
-        self.jobs, self.running, self.ended, self.stopping = jobs, {}, [], False
+        self.jobs, self.running, self.ended = jobs, {}, []
+        self.stopping = 0  # the number of the signal that asked for it
         self.lines, self.began = 0, time.monotonic()
 
     def run(self):
@@ -201,8 +204,8 @@ class Runner:
                 signal.signal(number, handler)
         return self.ended
 
-    def _stop(self, *_):
-        self.stopping = True
+    def _stop(self, number, _):
+        self.stopping = number
         for job in self.running:
             job.stop()
 
@@ -326,8 +329,8 @@ def submit(args, cells):
         refuse(f"sbatch refused with code {error.returncode}; the three lines to adapt stand in benchmark/cell.sbatch.")
 
 
-def report(skipped, jobs, waiting):
-    """What became of the cells; returns the exit code."""
+def report(skipped, jobs, waiting, signal_number):
+    """What became of the cells; returns the exit code, after a signal what shells say of it."""
     failed = [job for job in jobs if job.code != 0 and not job.stopped]
     finished = [job for job in jobs if job.code == 0]
     rest = len(waiting) + len(jobs) - len(failed) - len(finished)
@@ -335,7 +338,7 @@ def report(skipped, jobs, waiting):
     for job in failed:
         print(f"  {job.cell.name}: code {job.code}: {job.trouble or last_line(job.cell)}")
         print(f"    again: {shlex.join([*job.cell.command, '--overwrite'])}")
-    return 1 if failed else 143 if rest else 0
+    return 1 if failed else 128 + signal_number if rest else 0
 
 
 def main():
@@ -361,9 +364,11 @@ def run(args):
                 print(f"{cell.broken}; it is run again.")
         skipped = [cell for cell in cells if cell.finished]
         runner = Runner([cell for cell in cells if cell not in skipped], jobs, args.checkpoint_every)
-        code = report(skipped, runner.run(), runner.waiting)
+        ended = runner.run()
+        code = report(skipped, ended, runner.waiting, runner.stopping)
         if args.cell is None:
             show_table(cells)
+            print(f"\nThe cells are under {args.runs}.")
         sys.exit(code)
 
 

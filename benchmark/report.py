@@ -164,11 +164,18 @@ def versions(found):
 
 def time_needed(found, cores=2):
     """How long all cells take at Table 1's episodes, by the kept times; only of the paper's worlds in which there are some."""
-    pace = results.seconds_per_episode(found)
-    worlds = [world for world in WORLDS if any(w == world and result.seconds > 0 for (w, *_), result in found.items())]
+    cells = select(METHODS, WORLDS, OPTIMIZERS)
+    whole = {(cell.world, cell.method): (cell.num_trials, cell.settings["num_episodes"]) for cell in cells}
+    timed = {
+        (world, method, optimizer): result
+        for (world, method, optimizer), result in found.items()
+        if result.seconds > 0 and whole.get((world, method)) == (len(result.last), result.num_episodes)
+    }  # short runs mostly start and compile
+    worlds = [world for world in WORLDS if any(world == w for w, *_ in timed)]
     if not worlds:
         return ""
-    cells = select(METHODS, worlds, OPTIMIZERS)
+    pace = results.seconds_per_episode(timed)
+    cells = [cell for cell in cells if cell.world in worlds]
     hours = sum(pace[cell.method, cell.world] * cell.settings["num_episodes"] for cell in cells) / 3600 / cores
     return f"All cells of {', '.join(worlds)} at Table 1's episodes take about {hours:.1f} hours on {cores} cores."
 

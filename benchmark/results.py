@@ -131,11 +131,12 @@ def finished(runs, seeds=(1, 20), num_episodes=None, scripts=()):
     scripts: files of methods outside algos/
     """
     methods = {path_of(method).stem: method for method in (*(path.stem for path in (ROOT / "algos").glob("*.py")), *scripts)}
-    blocks = defaultdict(dict)
+    blocks, unknown = defaultdict(dict), set()
     for file in sorted(runs.rglob("episodes.npz")):
         try:
             found = settings_of(file.parent)
             if found["method"] not in methods:
+                unknown.add(found["method"])
                 continue
             method, optimizer = methods[found["method"]], found.get("optimizer", "adam")
             cell = Cell(method, found["env"], optimizer, found["seed"], found["num_trials"], num_episodes)
@@ -150,6 +151,8 @@ def finished(runs, seeds=(1, 20), num_episodes=None, scripts=()):
             print(f"{broken} and is left out.", file=sys.stderr)
         elif own:
             blocks[found["env"], found["method"], optimizer][found["seed"], found["seed"] + found["num_trials"]] = file.parent
+    for name in sorted(unknown):
+        print(f"The cells of {name}.py are left out: it is not in algos/, and --scripts does not name it.", file=sys.stderr)
     wholes = {key: cover(parts, seeds[0], seeds[1] + 1) for key, parts in blocks.items()}
     found = {}
     for key, parts in wholes.items():

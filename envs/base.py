@@ -6,6 +6,7 @@ function `observe` that says what each agent sees of it. Everything else (vector
 
 import atexit
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -14,7 +15,8 @@ from functools import cache, cached_property
 import numba
 import numpy as np
 from numba import float32, float64, int64, njit, typeof
-from numba.core.types import CompileResultWAP
+from numba.core.errors import NumbaError
+from numba.core.types import BaseTuple, CompileResultWAP
 
 
 def find_cache():
@@ -45,6 +47,14 @@ def by_address(function, *types):
     """
     function.compile(types)
     return CompileResultWAP(function.overloads[types])
+
+
+def reason_of(error):
+    """What numba says is wrong with a function, in one line: what it cannot do, and where."""
+    lines = [line.strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", str(error)).splitlines()]
+    what = next((line for line in lines if line and not line.startswith("Failed in")), type(error).__name__)
+    where = next((line.rstrip(":") for line in lines if line.startswith("File ")), "")
+    return f"{what.rstrip('.:')}{f' ({where})' if where else ''}"
 
 
 class UsageError(ValueError):
@@ -86,6 +96,8 @@ class World:
         self.max_steps = check_whole("max_steps", max_steps, minimum=1, maximum=LONGEST)
         if max(len(self.action_names), len(self.outcome_names)) > MOST_NAMES:
             raise UsageError(f"{self.name} must have at most {MOST_NAMES} actions and as many outcomes.")
+        if not 0 <= self.best_outcome <= len(self.outcome_names):
+            raise UsageError(f"{self.name}'s best_outcome must be one of its {len(self.outcome_names)} outcomes, or 0.")
         self.rules, self.start = rules, np.array(start, np.int64)
         self.local_index = np.array(local_index, np.int64)
         self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, float(cell)
@@ -102,7 +114,15 @@ class World:
             if not hasattr(function, "compile"):
                 raise UsageError(f"{self.name}'s step and observe must be functions compiled by envs.rule.")
         rules, state = typeof(self.rules), int64[::1]
-        return by_address(self.step, rules, state, state), by_address(self.observe, rules, float64, state, float32[:, ::1])
+        try:
+            step = by_address(self.step, rules, state, state)
+            observe = by_address(self.observe, rules, float64, state, float32[:, ::1])
+        except NumbaError as error:
+            raise UsageError(f"{self.name}'s rules cannot be compiled: {reason_of(error)}.") from error
+        returned = self.step.overloads[rules, state, state].signature.return_type
+        if not (isinstance(returned, BaseTuple) and len(returned) == 2):
+            raise UsageError(f"{self.name}'s step must return a reward and an outcome, not {returned}.")
+        return step, observe
 
     def plan(self):
         """Joint actions [max_steps, num_agents] of a good team, in a world that is not searchable and never ends early."""

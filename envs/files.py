@@ -14,5 +14,9 @@ def complete_file(path):
         with open(temporary, "wb") as file:
             yield file
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename == str(temporary):
+            error.filename = str(path)  # whoever reads of it knows no other name
+        raise
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,6 +1,7 @@
 """Pictures of all worlds: side by side in the style of the paper's Figure 2, and a film of each one's optimal play.
 
 python -m envs.gallery docs/worlds.png
+
 python -m envs.gallery --plays docs         optimal-<world>.gif for every world
 """
 

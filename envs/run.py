@@ -227,7 +227,9 @@ class Run:
         if foreign:
             raise envs.UsageError(f"{directory} holds other files ({foreign[0]}); a run needs a directory of its own.")
         if args.resume and not self.checkpoint.exists():
-            raise envs.UsageError(f"there is nothing to resume: {directory} holds no checkpoint of an unfinished run.")
+            raise envs.UsageError(
+                f"there is nothing to resume: {directory} holds no checkpoint of an unfinished run with these arguments."
+            )
         directory.mkdir(parents=True, exist_ok=True)
         self._own_directory()
         if args.resume:
@@ -476,7 +478,7 @@ def evaluate(given, script):
         raise envs.UsageError(f"{video} is there already; --overwrite replaces the film, not the policies.")
     args.seed, args.greedy = given.seed, given.greedy
     log = play_teams(args, world, team, num_episodes, video)
-    played = f"{num_episodes} episodes of {args.num_trials} teams"
+    played = f"{num_episodes} episode{'s' * (num_episodes > 1)} of {args.num_trials} team{'s' * (args.num_trials > 1)}"
     say(f"{given.evaluate}: {played}, {log.summary(share=1.0)}; one of them in {video}")
 
 
@@ -490,6 +492,8 @@ def main(args_class, build, train):
     script = sys.modules[args_class.__module__]
     with command_line(Path(script.__file__).name):
         args = tyro.cli(args_class, description=script.__doc__)
+        if args.greedy and not args.evaluate:
+            raise envs.UsageError("--greedy goes with --evaluate only; while they learn, agents draw their actions.")
         try:
             evaluate(args, script) if args.evaluate else train(args)
         except torch.linalg.LinAlgError as error:  # a matrix that is no longer one, as that of EMI's embeddings

@@ -104,13 +104,14 @@ def test_killed_scripts_and_runners_lose_nothing(tmp_path):
             assert np.array_equal(episodes(cell)[name], values)
 
 
-def test_a_polite_stop_leaves_checkpoints(tmp_path):
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_polite_stop_leaves_checkpoints(number, code, tmp_path):
     _, decespg = cells(tmp_path)
     runner = start(tmp_path)
     wait_for_episode(decespg, 5)
-    runner.send_signal(signal.SIGTERM)
+    runner.send_signal(number)
     said, _ = runner.communicate(timeout=300)
-    assert runner.returncode == 143
+    assert runner.returncode == code
     assert "0 failed" in said
     assert compare.state(decespg) == "stopped"
     assert re.search(
@@ -182,13 +183,16 @@ def test_other_settings_are_another_directory(cell, monkeypatch):
 
 def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, capsys):
     text = (ROOT / "algos" / "pg.py").read_text(encoding="utf-8")
-    (tmp_path / "mine.py").write_text(text.replace("str(Path(__file__).resolve().parents[1])", repr(str(ROOT))))
+    (tmp_path / "mine.py").write_text(text)
     world = ROOT / "tests" / "data" / "race.py"
     words = ["--algos", tmp_path / "mine.py", "--envs", world, "--optimizers", "sign"]
     code, said, _ = command(monkeypatch, capsys, *words, "--episodes", 100, "--runs", tmp_path / "runs")
     assert (code, "1 finished, 0 failed" in said) == (0, True), said
     found = results.finished(tmp_path / "runs", num_episodes=100, scripts=[str(tmp_path / "mine.py")])
     assert list(found) == [(str(world), "mine", "sign")]
+    capsys.readouterr()
+    assert not results.finished(tmp_path / "runs", num_episodes=100)
+    assert "mine.py are left out: it is not in algos/, and --scripts does not name it" in capsys.readouterr().err
     assert found[str(world), "mine", "sign"].actions.any()
     assert report.score_table(found)[1][:2] == ["race", "mine"]
     drawn = figures.learning_curves(found, results.named_in(found)[1])

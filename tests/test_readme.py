@@ -157,7 +157,7 @@ def put_in_the_place_of_the_window(bonus, folder):
     """Make folder/algos/counts.py, decespg.py with another bonus."""
     script = (ROOT / "algos" / "decespg.py").read_text(encoding="utf-8")
     changed = re.sub(r"class VisitNovelty:.*?\n\n\n(?=class )", lambda _: bonus + "\n\n", script, flags=re.DOTALL)
-    changed = changed.replace("import numpy as np\n", "from collections import defaultdict\n\nimport numpy as np\n", 1)
+    changed = changed.replace("import numpy as np\n", "from zlib import crc32\n\nimport numpy as np\n", 1)
     assert changed.count("class VisitNovelty") == 1
     (folder / "algos").mkdir()
     (folder / "algos" / "counts.py").write_text(changed)
@@ -167,7 +167,7 @@ def put_in_the_place_of_the_window(bonus, folder):
 def test_the_example_of_a_bonus_takes_the_place_of_the_window(tmp_path):
     put_in_the_place_of_the_window(example("1 / sqrt(n) for the n-th visit"), tmp_path)
     train = "import sys; sys.path.insert(0, 'algos'); import counts; run = counts.train(counts.Args(num_episodes=30));"
-    said = python(tmp_path, "-c", train + "print(sum(run.novelty.counts.values()), 2 * run.log.lengths.sum())")
+    said = python(tmp_path, "-c", train + "print(run.novelty.counts.sum(), 2 * run.log.lengths.sum())")
     remembered, steps = map(int, said.splitlines()[-1].split())
     assert remembered == steps > 60
 

@@ -141,6 +141,11 @@ def test_a_smoke_run_has_a_report_of_its_own(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "store").exists()
 
 
+def test_how_long_all_cells_take_is_not_guessed_from_short_runs(kept):
+    assert re.search(r"take about \d+\.\d hours on 2 cores", report.time_needed(kept))
+    assert report.time_needed({key: dataclasses.replace(result, num_episodes=50) for key, result in kept.items()}) == ""
+
+
 @pytest.mark.parametrize(
     ("args", "said"),
     [

@@ -368,6 +368,22 @@ def test_an_edited_world_plays_by_its_new_rules(tmp_path):
         ("1 / 0", "cannot be imported: ZeroDivisionError: division by zero"),
         ("def", "cannot be imported: SyntaxError"),
         (RACE.read_text(encoding="utf-8").replace("@envs.rule\n", ""), "must be functions compiled by envs.rule"),
+        (
+            RACE.read_text(encoding="utf-8").replace("return -0.1, 0", "return reword, 0"),
+            "race's rules cannot be compiled: NameError: name 'reword' is not defined",
+        ),
+        (
+            RACE.read_text(encoding="utf-8").replace("range(2)", "state.agents"),
+            r"race's rules cannot be compiled: Unknown attribute 'agents' of type array.* \(File .*race.py.*, line 13\)",
+        ),
+        (
+            RACE.read_text(encoding="utf-8").replace("REWARD, 1", "REWARD").replace("-0.1, 0", "-0.1"),
+            "race's step must return a reward and an outcome, not float64",
+        ),
+        (
+            RACE.read_text(encoding="utf-8").replace("best_outcome = 1", "best_outcome = 2"),
+            "must be one of its 1 outcomes, or 0",
+        ),
     ],
 )
 def test_a_file_without_a_world_says_what_is_wrong(text, said, tmp_path):

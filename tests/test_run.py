@@ -612,6 +612,7 @@ BAD_INPUT = {
     "--max-steps 2000000000": "1 x 2000000000 steps of an episode would need",
     "--hidden 10000000000": "2 networks with hidden layers of 10000000000 would need",
     "--resume": "there is nothing to resume",
+    "--greedy": "--greedy goes with --evaluate only",
     "--run-dir file": "cannot write to file",
     "--run-dir file/below": "cannot write to file/below",
     f"--run-dir {'x' * 300}": "File name too long",
