@@ -69,7 +69,7 @@ class Args(RunArgs):
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     truncation: Annotated[float, AtLeast(1)] = 10.0

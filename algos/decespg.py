@@ -66,7 +66,7 @@ class Args(RunArgs):
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
     """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
     window: Annotated[int, AtLeast(1)] = 50
@@ -76,7 +76,7 @@ class Args(RunArgs):
     noise: Annotated[float, AtLeast(1e-6)] = 0.01
     """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes that the memory keeps for each terminal state, 0: none (None: 3 in cleaner and movebox, 10 elsewhere)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py; 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

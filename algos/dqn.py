@@ -64,7 +64,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the Q-networks (None: tuned for each world; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     exploration: Annotated[float | None, Between(1e-3, 1)] = None
     """share of the episodes over which epsilon falls linearly from 1 to 0.05 (None: tuned for the world; 0.2 in others)"""
     buffer_size: Annotated[int, AtLeast(1)] = 20_000

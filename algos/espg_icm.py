@@ -67,7 +67,7 @@ class Args(RunArgs):
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
     """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
     icm_learning_rate: Annotated[float, AtLeast(0)] = 1e-3
@@ -79,7 +79,7 @@ class Args(RunArgs):
     icm_hidden: Annotated[tuple[int, ...], AtLeast(1)] = (64,)
     """widths of the hidden layers of the inverse and the forward model (those of phi: --hidden)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes that the memory keeps for each terminal state, 0: none (None: 3 in cleaner and movebox, 10 elsewhere)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py; 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

@@ -70,7 +70,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the Q-networks (None: tuned for each world; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     hysteresis: Annotated[float | None, Between(0, 1)] = None
     """h, what is left of a step where the error is negative: 1 all, 0 nothing (None: tuned for the world; 0.2 in others)"""
     exploration: Annotated[float | None, Between(1e-3, 1)] = None

@@ -63,7 +63,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the policies and the critics (None: tuned for each world; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     entropy_coef: Annotated[float | None, AtLeast(0)] = None
     """weight of the policies' entropy, c beside normalised advantages (None: tuned for the world; 0.01 in other worlds)"""
     gae_lambda: Annotated[float, Between(0, 1)] = 0.95

@@ -64,9 +64,9 @@ class Args(RunArgs):
     optimizer: Literal["sign", "adam"] = "sign"
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of the policies (None: tuned for world and optimiser; 0.001 in other worlds)"""
+    """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes that the memory keeps for each terminal state, 0: none (None: tuned for world and optimiser; 10 in others)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py; 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:
