@@ -52,18 +52,18 @@ WORLDS = {
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/gasil.csv); guesses where it has no row yet.
 TUNED = {
-    ("cleaner", "sign"): dict(learning_rate=1e-3, beta=0.01, lambda_im=0.3),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=0.3),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=30.0),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, lambda_im=30.0),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=0.3),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.1, lambda_im=1.0),
-    ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=10.0),
-    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.1, lambda_im=10.0),
-    ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0, lambda_im=30.0),
-    ("pushbox", "adam"): dict(learning_rate=3e-3, beta=10.0, lambda_im=30.0),
+    ("cleaner", "sign"): dict(learning_rate=1e-3, beta=0.01, lambda_im=0.3, rise=430),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=0.3, rise=430),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=30.0, rise=215),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, lambda_im=30.0, rise=215),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=0.3, rise=215),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.03, lambda_im=1.0, rise=215),
+    ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=10.0, rise=430),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=10.0, rise=430),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0, lambda_im=30.0, rise=430),
+    ("pushbox", "adam"): dict(learning_rate=3e-3, beta=10.0, lambda_im=30.0, rise=430),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.1, lambda_im=1.0)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, beta=0.1, lambda_im=1.0, rise=215)  # what a world of your own gets
 
 
 @dataclass
@@ -86,8 +86,8 @@ class Args(RunArgs):
     """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
     lambda_im: Annotated[float | None, AtLeast(0)] = None
     """final weight of the imitation reward, in units of reward (None: tuned for world and optimiser; 1 in other worlds)"""
-    rise: Annotated[float, Between(1e-3, 1)] = 0.086
-    """share of the episodes in which lambda_im rises to its final weight (Hao et al.: 12 000 of 140 000)"""
+    rise: Annotated[int | None, AtLeast(1)] = None
+    """episodes in which lambda_im rises to its final weight (None: 430 where Table 1 has 20 000 episodes, else 215)"""
     good_episodes: Annotated[int, AtLeast(1)] = 32
     """best episodes that the team keeps, and how many it has before anybody imitates (Hao et al.)"""
     good_label: Annotated[float, Between(0, 1)] = 0.9
@@ -385,7 +385,7 @@ def train(args: Args):
             d_good, d_own = team.discriminators.learn(good_steps, own_steps)
 
             # Augment each agent's reward with that for what looks like good episodes.
-            lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / (args.rise * args.num_episodes) - 1)))
+            lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / args.rise - 1)))
             augmented += lambda_im * team.discriminators.reward(rollout)
 
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.

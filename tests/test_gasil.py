@@ -247,7 +247,7 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
     updates = record_all_updates(gasil, monkeypatch)
     trials, episodes, gamma, beta, lambda_im, kernel = 2, 20, 0.9, 0.7, 3.0, dict(window=5, sigma=0.9, noise=0.2)
     args = dict(env=env, seed=2, num_trials=trials, num_episodes=episodes, max_steps=10, learning_rate=0.02, log_every=1)
-    args.update(gamma=gamma, beta=beta, lambda_im=lambda_im, rise=0.5, good_episodes=3, good_batch=20, good_label=0.8)
+    args.update(gamma=gamma, beta=beta, lambda_im=lambda_im, rise=10, good_episodes=3, good_batch=20, good_label=0.8)
     trained = train(gasil, tmp_path, **args, **kernel, discriminator_hidden=(6,), discriminator_learning_rate=0.3)
     assert len(updates) == 2 + 2 * 18  # the policies', and from the third episode on the discriminators' before each of them
     of_policies, of_discriminators = updates[:2] + updates[3::2], [None, None, *updates[2::2]]
@@ -258,7 +258,7 @@ def test_every_update_of_discriminators_and_policies(env, tmp_path, monkeypatch)
     shown = [curves(tmp_path / f"seed{2 + k}") for k in range(trials)]
     rewards, ends, all_norms = [], set(), []
     for n, (discriminators, (rollout, params, direction)) in enumerate(zip(of_discriminators, of_policies, strict=True)):
-        weight = lambda_im * min(1, np.exp(-6 * (1 - n / (0.5 * episodes))))
+        weight = lambda_im * min(1, np.exp(-6 * (1 - n / 10)))
         own_steps = {}
         for k, length in enumerate(rollout.lengths):
             obs, actions, reward = rollout.all_obs[:length, k], rollout.actions[:length, k], rollout.reward[:length, k, 0]
