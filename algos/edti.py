@@ -7,18 +7,18 @@ they go next:
     with u_i = eta / sqrt(N(x_i') + 1) and c_ij = 1 - p(x_j' | x_-i, a_-i) / p(x_j' | x, a).
 
 x_i is agent i's local state (its place and facing, and the boxes), N and p are counts, a prime marks what follows a step, and
--i means all agents but i. Every agent learns like ac.py's, but from three values of its own observation: V_i of rhat_i, which
-its actor needs, V_i^ext of r, V_i^int of u_i. ac.py's critic of the global state becomes these, because what c_ij weighs is the
-value of o_j to agent j, and because the paper says of EDTI only that its agents are local (Jiang & Amato, SAC 2021); it does
-not say on which learner EDTI ran.
+-i means all agents but i. Every agent learns like ac.py's, but from generalised advantages, and from three values of its own
+observation: V_i of rhat_i, which its actor needs, V_i^ext of r, V_i^int of u_i. ac.py's critic of the global state becomes
+these, because what c_ij weighs is the value of o_j to agent j, and because the paper says of EDTI only that its agents are
+local (Jiang & Amato, SAC 2021); it does not say on which learner EDTI ran.
 
 rhat is that of the published code (TonghanWang/EITI-EDTI, Curiosity.py and ppo2/runner.py: count-based probabilities and the
 option --r_tv, which README.md says is EDTI). The weights are those of README.txt's command for the task Pass, the only ones
 published; it names the shares, too, though it runs --tv, which leaves them out. Without shares, with these and with share_int 1
-five teams end in findtreasure at 5.4, 6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3 (adam), each +- 1 to 2. That of r only makes it
-count more, because r is the team's. The reward of Pass is 1000 and u adds to r, so eta is scaled by the world's largest reward
-/ 1000. The other weights are not: they and c have no unit, and V^ext and V^int have that of r and u. Unlike there, nothing
-follows the step that terminates an episode, and PPO gives way to ac.py's update.
+five teams of an earlier version, with one-step errors, end in findtreasure at 5.4, 6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3
+(adam), each +- 1 to 2. That of r only makes it count more, because r is the team's. The reward of Pass is 1000 and u adds to r,
+so eta is scaled by the world's largest reward / 1000. The other weights are not: they and c have no unit, and V^ext and V^int
+have that of r and u. Unlike there, nothing follows the step that terminates an episode, and PPO gives way to ac.py's update.
 
     python algos/edti.py --env pushbox --num-trials 20
 """
@@ -84,6 +84,8 @@ class Args(RunArgs):
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
+    gae_lambda: Annotated[float, Between(0, 1)] = 0.95
+    """lambda of the advantages: 0 looks one step ahead, 1 to the end of the episode (Schulman et al., 2016)"""
     eta: Annotated[float | None, AtLeast(0)] = None
     """weight of the novelty u, in thousandths of the world's largest reward (None: tuned for world and optimiser, else 10)"""
     share_ext: Annotated[float, AtLeast(0)] = 0.1
@@ -143,6 +145,18 @@ def td_errors(reward, values, lengths, terminated, gamma):
     goes_on = (steps < lengths - 1) | ~terminated
     delta = reward + gamma * goes_on * values[1:] - values[:-1]
     return np.where(steps < lengths, delta, 0.0)
+
+
+@njit(cache=True)
+def discounted_errors(delta, decay):
+    """A_t = delta_t + decay A_{t+1}; with decay = gamma lambda these are generalised advantages (Schulman et al., 2016).
+
+    delta [T, num_critics], 0 beyond an episode's end -> shaped as delta.
+    """
+    advantages = delta.copy()
+    for t in range(len(delta) - 2, -1, -1):
+        advantages[t] += decay * advantages[t + 1]
+    return advantages
 
 
 @njit(cache=True)
@@ -288,30 +302,32 @@ def train(args: Args):
         values = in_every_step(team.critic(inputs), np.tile(rows, 3))[..., 0].flatten(1)  # [T + 1, num_critics]
         detached = values.detach().double().numpy()
 
-        # The agents' augmented rewards, and the errors of all three values.
+        # The agents' augmented rewards, and the generalised advantages of all three values.
         of_kind = detached.reshape(-1, trials, 3, agents)
         worth = (of_kind * np.array([[0.0], [args.beta_ext], [args.beta_int]])).sum(2)
         shared = args.share_ext * reward + args.share_int * bonus
         augmented = reward + bonus + influence_rewards(shared, influence, worth, lengths, terminated, args.gamma)
         rewards = np.stack([augmented, reward, bonus], axis=2).reshape(len(reward), -1)  # [T, num_critics]
         delta = td_errors(rewards, detached, lengths[of_critic], terminated[of_critic], args.gamma)
+        advantages = discounted_errors(delta, args.gamma * args.gae_lambda)
 
-        # Actors: climb along 1/T sum_t delta_i,t grad log pi_i(a_t | o_t), with the errors of V_i.
-        advantage = delta.reshape(-1, trials, 3, agents)[:, :, 0]  # [T, num_trials, num_agents]
+        # Actors: climb along 1/T sum_t A_i,t grad log pi_i(a_t | o_t), with the advantages of V_i.
+        of_actors = [x.reshape(-1, trials, 3, agents)[:, :, 0] for x in (advantages, delta)]
+        advantage, error = of_actors  # [T, num_trials, num_agents]
         weights = torch.from_numpy(advantage / lengths[:, None])
         log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]
         update(optimizer, args.optimizer, loss.sum())
 
         # Critics: descend 1/T sum_t (y_t - V(o_t))^2; beyond an episode's end y_t = V(o_t).
-        targets = torch.from_numpy(detached[:-1] + delta)
+        targets = torch.from_numpy(detached[:-1] + advantages)
         critic_loss = ((targets - values[:-1]) ** 2 / torch.from_numpy(lengths[of_critic])).sum()
         update(critic_optimizer, "adam", critic_loss)
 
         steps = agents * lengths
         figures = dict(
             value=REWARD_SCALE * (of_kind[:-1, :, 0] * rollout.played[:, :, None]).sum((0, 2)) / steps,
-            td_error=REWARD_SCALE * np.sqrt((advantage**2).sum((0, 2)) / steps),
+            td_error=REWARD_SCALE * np.sqrt((error**2).sum((0, 2)) / steps),
             novelty=eta * novelty.sum((0, 2)) / steps,
             influence=influence.sum((0, 2, 3)) / (max(agents - 1, 1) * steps),
             table_fill=team.transitions.filled / args.table_size,

@@ -261,7 +261,7 @@ def test_eta_is_relative_to_the_largest_reward(env):
 def test_every_update_of_actors_and_critics(env, tmp_path, monkeypatch):
     updates = record_all_updates(edti, monkeypatch)
     args = dict(env=env, seed=1, num_trials=3, num_episodes=12, max_steps=15, learning_rate=0.05, gamma=0.9)
-    own = dict(eta=50.0, share_ext=0.4, share_int=0.6, beta_ext=3.0, beta_int=7.0)
+    own = dict(gae_lambda=0.8, eta=50.0, share_ext=0.4, share_int=0.6, beta_ext=3.0, beta_int=7.0)
     transitions = train(edti, tmp_path, **args, **own, critic_learning_rate=0.1, log_every=1, table_size=4096).transitions
     assert len(updates) == 24
     shown = [curves(tmp_path / f"seed{1 + k}") for k in range(3)]
@@ -278,7 +278,7 @@ def test_every_update_of_actors_and_critics(env, tmp_path, monkeypatch):
             steps = [(rollout.local_state[t, k], rollout.actions[t, k], rollout.local_state[t + 1, k]) for t in range(length)]
             new, influence = map(np.array, zip(*[plain[k].add(*step) for step in steps], strict=True))
             bonus = 50 * 100 / 1000 * new  # [T, 2], in units of reward
-            delta = np.zeros((2, length))
+            delta, advantages = np.zeros((2, 2, length))
             for i, j in [(0, 1), (1, 0)]:
                 total = 1.4 * rollout.reward[:length, k, 0] / 10 + bonus[:, i] / 10 + 0.6 * bonus[:, j] / 10
                 for t in range(length):
@@ -289,17 +289,18 @@ def test_every_update_of_actors_and_critics(env, tmp_path, monkeypatch):
                 rewards = [total, rollout.reward[:length, k, 0] / 10, bonus[:, i] / 10]
                 for kind, reward in enumerate(rewards):
                     errors = np.array(plain_errors(reward, values[kind, i], end, 0.9))
+                    summed = np.array([sum((0.9 * 0.8) ** n * e for n, e in enumerate(errors[t:])) for t in range(length)])
                     net = 6 * k + 2 * kind + i
                     expected = critic_descent(
-                        critics.params, net, rollout.all_obs[:length, k, i], errors + values[kind, i, :-1]
+                        critics.params, net, rollout.all_obs[:length, k, i], summed + values[kind, i, :-1]
                     )
                     for found, direction in zip(critics.direction, expected, strict=True):
                         scale = max(1.0, float(direction.abs().max()))
                         assert np.allclose(found[net], direction, rtol=1e-4, atol=1e-5 * scale)
                     if kind == 0:
-                        delta[i] = errors
+                        delta[i], advantages[i] = errors, summed
                 obs, actions = rollout.all_obs[:length, k, i], rollout.actions[:length, k, i]
-                steps_of.append(list(zip(obs, actions, delta[i] / length, strict=True)))
+                steps_of.append(list(zip(obs, actions, advantages[i] / length, strict=True)))
             figures = dict(value=10 * values[0, :, :-1].mean(), td_error=10 * np.sqrt((delta**2).mean()))
             figures.update(
                 novelty=bonus.mean(), influence=influence.sum() / (2 * length), table_fill=len(plain[k].counts) / 4096
@@ -349,7 +350,8 @@ def test_without_values_and_novelty_it_is_pg_of_the_shared_reward_alone_bit_for_
     monkeypatch.setattr(edti, "REWARD_SCALE", 2.0)  # half of the reward, and once more its half for the other agent
     args = dict(env=env, optimizer=optimizer, seed=5, num_trials=2, num_episodes=60, learning_rate=1e-3)
     plain = train(pg, tmp_path / "pg", **args, gamma=0.0)
-    assert_same_run(plain, train(edti, tmp_path / "edti", **args, eta=0.0, share_ext=1.0, critic_learning_rate=0.0))
+    own = dict(eta=0.0, share_ext=1.0, critic_learning_rate=0.0, gae_lambda=0.0)
+    assert_same_run(plain, train(edti, tmp_path / "edti", **args, **own))
 
 
 def test_edti_leaves_the_local_optimum_of_findtreasure(tmp_path):
