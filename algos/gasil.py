@@ -385,7 +385,7 @@ def train(args: Args):
             d_good, d_own = team.discriminators.learn(good_steps, own_steps)
 
             # Augment each agent's reward with that for what looks like good episodes.
-            lambda_im = args.lambda_im * min(1.0, np.exp(6 * (episode / args.rise - 1)))
+            lambda_im = args.lambda_im * np.exp(6 * min(0.0, episode / args.rise - 1))
             augmented += lambda_im * team.discriminators.reward(rollout)
 
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.

@@ -398,6 +398,7 @@ BAD_INPUT_OF = {
     },
     "edti": {
         **BAD_CRITIC,
+        "--gae-lambda 1.1": "--gae-lambda must be a number between 0 and 1, not 1.1",
         "--eta -1": "--eta must be a number of at least 0, not -1",
         "--beta-ext -1": "--beta-ext must be a number of at least 0, not -1",
         "--beta-int -1": "--beta-int must be a number of at least 0, not -1",
@@ -406,8 +407,7 @@ BAD_INPUT_OF = {
     "gasil": {
         **BAD_BONUS,
         "--lambda-im -1": "--lambda-im must be a number of at least 0, not -1",
-        "--rise 0": "--rise must be a number between 0.001 and 1, not 0",
-        "--rise 2": "--rise must be a number between 0.001 and 1, not 2",
+        "--rise 0": "--rise must be a number of at least 1, not 0",
         "--good-episodes 0": "--good-episodes must be a number of at least 1, not 0",
         "--good-label 1.1": "--good-label must be a number between 0 and 1, not 1.1",
         "--good-batch 0": "--good-batch must be a number of at least 1, not 0",
