@@ -312,8 +312,8 @@ def train(args: Args):
         advantages = discounted_errors(delta, args.gamma * args.gae_lambda)
 
         # Actors: climb along 1/T sum_t A_i,t grad log pi_i(a_t | o_t), with the advantages of V_i.
-        of_actors = [x.reshape(-1, trials, 3, agents)[:, :, 0] for x in (advantages, delta)]
-        advantage, error = of_actors  # [T, num_trials, num_agents]
+        advantage = advantages.reshape(-1, trials, 3, agents)[:, :, 0]  # [T, num_trials, num_agents]
+        error = delta.reshape(-1, trials, 3, agents)[:, :, 0]
         weights = torch.from_numpy(advantage / lengths[:, None])
         log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]

@@ -7,7 +7,7 @@
    is positive for what good episodes do more often than the current one, and negative for what they do less often.
 
 Hao et al., "Independent Generative Adversarial Self-Imitation Learning in Cooperative Multiagent Systems" (AAMAS 2019). Labels,
-r_im, the rise of lambda_im, the number of good episodes, without which nobody imitates, and D's layers, Adam (0.5, 0.9) and
+r_im, the curve of lambda_im, the number of good episodes, without which nobody imitates, and D's layers, Adam (0.5, 0.9) and
 clipped gradients are those of its code, which trains deterministic policies with critics for 140 000 episodes
 (github.com/tjuHaoXiaotian/GASIL). Here policies draw their actions and learn from the episode that they have just played,
 never from stored actions, as in Guo et al., "Generative Adversarial Self-Imitation Learning" (2018). What else differs:
