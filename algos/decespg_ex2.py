@@ -9,13 +9,12 @@ Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and
 no setting of EX2. Model and loss are those of Fu, Co-Reyes & Levine, "EX2: Exploration with Exemplar Models for Deep
 Reinforcement Learning" (NIPS 2017), amortised over exemplars, and of the published code (jcoreyes/ex2): pairs with actions and
 -log p as in its pointmass.py, kl_weight as in doom.py, min_replay as in atari.py. That fits 1000 times to 128 exemplars after
-every 4000 steps, at a step size of 1e-4, which would take most of the time here. So the networks are smaller, and fits are to
-32 exemplars at 1e-2: four after each of the first 1000 episodes, and one after every fifth of the others, which are short. In
-pushbox the bonus then goes along with the true -log p at a correlation of 0.7 after 500 episodes and 0.8 after 1000, as with a
-fit for every 8 steps of play; with one fit for each episode at 0.3 and 0.6. With so little fitting the kl_weight 0.01 of
-pointmass.py held D at 1/2, which is no bonus at all, and it matters where the networks begin: weights of unit gain, and little
-noise in the codes. The bonus lies in [0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike
-there its median is not subtracted.
+every 4000 steps, at a step size of 1e-4, which would take most of the time here. So the networks are smaller, and there is one
+fit to 32 exemplars for every 20 steps, at 1e-2. With so little fitting two encoders that share nothing hardly tell pairs apart;
+here one reads both, and the classifier sees how far the codes are from each other, too. The kl_weight 0.01 of pointmass.py held
+D at 1/2, which is no bonus at all, and it matters where the networks begin: weights of unit gain, and little noise in the
+codes. The bonus lies in [0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike there its median
+is not subtracted.
 
     python algos/decespg_ex2.py --env pushbox --seed 3
 """
@@ -85,6 +84,8 @@ class Args(RunArgs):
     """exemplars in the batch of a fit; there are as many earlier pairs"""
     buffer_size: Annotated[int, AtLeast(1)] = 20_000
     """steps that are kept for replay"""
+    steps_per_fit: Annotated[int, AtLeast(1)] = 20
+    """steps of play for one fit of the discriminators (4 in the published code)"""
     min_replay: Annotated[int, AtLeast(1)] = 1000
     """earlier steps without which the discriminators are not fitted and give no bonus (as in the published atari.py)"""
     slots: Annotated[int | None, AtLeast(0)] = None
@@ -158,25 +159,23 @@ class MaskedAdam:
             adam_step(*arrays, self.count, active, self.learning_rate)
 
 
-def fits_after(episode):
-    """How often the discriminators are fitted after an episode: most while the teams still explore, whose episodes are long."""
-    return 4 if episode < 1000 else int(episode % 5 == 0)
-
-
 class ExemplarDiscriminator:
     """D(u*, u), the probability that u is the exemplar u* itself and not an earlier pair; side by side for all windows.
 
-    One encoder reads u*, another u; each gives the mean and the log variance of a normal code. A classifier reads both codes.
+    One encoder gives the mean and the log variance of a normal code of each. A classifier reads both codes and their distance.
     """
 
     def __init__(self, generators, nets_per_trial, pair_dim):
-        self.encoders = [StackedMLP(generators, nets_per_trial, [pair_dim, HIDDEN, 2 * CODE]) for _ in range(2)]
-        self.classifier = StackedMLP(generators, nets_per_trial, [2 * CODE, HIDDEN, 1])
-        self.params = [param for part in (*self.encoders, self.classifier) for param in part.params]
+        self.encoder = StackedMLP(generators, nets_per_trial, [pair_dim, HIDDEN, 2 * CODE])
+        self.classifier = StackedMLP(generators, nets_per_trial, [3 * CODE, HIDDEN, 1])
+        self.params = [*self.encoder.params, *self.classifier.params]
         for param in self.params:
             param.data *= 3**0.5  # from U(-1/sqrt(in), 1/sqrt(in)) to a variance of 1/in, so that codes differ from the start
-        for encoder in self.encoders:
-            encoder.params[-1].data[..., CODE:] = -4.0  # the log variances: at first the noise does not hide the codes
+        self.encoder.params[-1].data[..., CODE:] = -4.0  # the log variances: at first the noise does not hide the codes
+
+    def compare(self, exemplar, other):
+        """log D / (1 - D) of codes [num_nets, batch, CODE] each -> [num_nets, batch]."""
+        return self.classifier(torch.cat([exemplar, other, (exemplar - other).abs()], dim=2))[..., 0]
 
     def losses(self, exemplars, earlier, noise):
         """Mean cross entropy of a batch, and mean divergence KL(N(mean, variance) || N(0, 1)) of both codes, [num_nets] each.
@@ -184,12 +183,11 @@ class ExemplarDiscriminator:
         Every exemplar is paired with itself and with an earlier pair; exemplars and earlier [num_nets, batch, pair_dim].
         noise [num_nets, 3 * batch, CODE], standard normal, is for the codes of the exemplars as u*, as u, and of the earlier.
         """
-        first, second = self.encoders[0](exemplars), self.encoders[1](torch.cat([exemplars, earlier], dim=1))
-        mean, log_variance = torch.cat([first, second], dim=1).chunk(2, dim=2)
+        first, other = self.encoder(torch.cat([exemplars, earlier], dim=1)).chunk(2, dim=1)
+        mean, log_variance = torch.cat([first, first, other], dim=1).chunk(2, dim=2)
         deviation = (log_variance / 2).exp()
         exemplar, same, other = (mean + deviation * noise).chunk(3, dim=1)
-        codes = torch.cat([torch.cat([exemplar, same], dim=2), torch.cat([exemplar, other], dim=2)], dim=1)
-        of_same, of_other = self.classifier(codes)[..., 0].chunk(2, dim=1)
+        of_same, of_other = self.compare(exemplar, same), self.compare(exemplar, other)
         cross_entropy = (softplus(-of_same) + softplus(of_other)).mean(1) / 2  # -log D and -log(1 - D)
         divergence = 0.5 * (mean**2 + deviation**2 - 1 - log_variance).sum(2)
         exemplar, same, other = divergence.chunk(3, dim=1)
@@ -198,8 +196,8 @@ class ExemplarDiscriminator:
     @torch.no_grad()
     def surprise(self, pairs):
         """-log p(u) = log D(u, u) / (1 - D(u, u)) of pairs [num_nets, batch, pair_dim], from the means of the codes."""
-        means = [encoder(pairs).chunk(2, dim=2)[0] for encoder in self.encoders]
-        return self.classifier(torch.cat(means, dim=2))[..., 0]
+        mean, _ = self.encoder(pairs).chunk(2, dim=2)
+        return self.compare(mean, mean)
 
 
 class ExemplarNovelty:
@@ -215,15 +213,14 @@ class ExemplarNovelty:
         self.cross_entropy = np.full(len(init), np.log(2))  # mean of the last fits; before the first, that of D = 1/2
         self.state = [*self.discriminator.params, *self.optimizer.state, self.buffer, self.visits, self.cross_entropy]
 
-    def bonus(self, pairs, lengths, fits):
+    def bonus(self, pairs, lengths):
         """EB = -log p(u) of each pair u of an episode, [T, num_trials, num_windows]; first fit, then remember, then judge.
 
         It is 0 until the discriminators have been fitted, which takes `min_replay` earlier pairs. Also returns the mean cross
         entropy of the last fits and the share of pairs with D < 1/2, both [num_trials].
         """
-        enough = self.visits >= self.args.min_replay
-        if fits and enough.any():
-            self.fit(pairs, lengths, fits, enough)
+        due = (self.visits + lengths) // self.args.steps_per_fit - self.visits // self.args.steps_per_fit
+        self.fit(pairs, lengths, np.where(self.visits >= self.args.min_replay, due, 0))
         self.remember(pairs, lengths)
         steps, trials, windows, dim = pairs.shape
         nets_first = torch.from_numpy(pairs).permute(1, 2, 0, 3).reshape(trials * windows, steps, dim)
@@ -238,31 +235,32 @@ class ExemplarNovelty:
         fitted = (self.optimizer.count > 0)[:, None, None]
         return np.where(fitted, surprise.clip(0, np.log(1e5 - 1)).reshape(pairs.shape[:3]), 0.0)
 
-    def fit(self, pairs, lengths, fits, enough):
-        """Several steps of Adam for the discriminators of the trials in the mask `enough`."""
-        total = 0.0
-        for exemplars, earlier, noise in zip(*self.draw(pairs, lengths, fits, enough), strict=True):
+    def fit(self, pairs, lengths, fits):
+        """Steps of Adam for the discriminators, in each trial as many as `fits` [num_trials] says."""
+        total = np.zeros(len(fits))
+        for number, (exemplars, earlier, noise) in enumerate(zip(*self.draw(pairs, lengths, fits), strict=True)):
             cross_entropy, divergence = self.discriminator.losses(exemplars, earlier, noise)
             loss = (cross_entropy + self.args.kl_weight * divergence).sum()
-            self.optimizer.step(loss, enough)
-            total += cross_entropy.detach().numpy()
-        self.cross_entropy[enough] = (total / fits).reshape(len(enough), -1).mean(1)[enough]
+            self.optimizer.step(loss, number < fits)
+            total += (number < fits) * cross_entropy.detach().numpy().reshape(len(fits), -1).mean(1)
+        fitted = fits > 0
+        self.cross_entropy[fitted] = total[fitted] / fits[fitted]
 
-    def draw(self, pairs, lengths, fits, enough):
-        """The batches of all fits, drawn with each trial's own generator; 0 for trials outside the mask `enough`.
+    def draw(self, pairs, lengths, fits):
+        """The batches of all fits, drawn with each trial's own generator; 0 for a trial that has no more fits.
 
-        -> exemplars of the episode and earlier pairs, both [fits, num_nets, exemplars, pair_dim], and the noise of
-        the codes [fits, num_nets, 3 * exemplars, CODE]
+        -> exemplars of the episode and earlier pairs, both [most fits, num_nets, exemplars, pair_dim], and the noise of
+        the codes [most fits, num_nets, 3 * exemplars, CODE]
         """
         trials, windows, size, dim = self.buffer.shape
-        drawn = fits, windows, self.args.exemplars
-        exemplars, earlier = np.zeros((2, fits, trials, *drawn[1:], dim), np.float32)
-        noise = np.zeros((fits, trials, windows, 3 * self.args.exemplars, CODE), np.float32)
+        exemplars, earlier = np.zeros((2, fits.max(), trials, windows, self.args.exemplars, dim), np.float32)
+        noise = np.zeros((fits.max(), trials, windows, 3 * self.args.exemplars, CODE), np.float32)
         each = np.arange(windows)[:, None]
-        for k in np.flatnonzero(enough):
-            exemplars[:, k] = pairs[self.learn[k].integers(lengths[k], size=drawn), k, each]
-            earlier[:, k] = self.buffer[k, each, self.learn[k].integers(min(self.visits[k], size), size=drawn)]
-            noise[:, k] = self.learn[k].standard_normal(noise[:, k].shape, dtype=np.float32)
+        for k in np.flatnonzero(fits):
+            drawn, own = (fits[k], windows, self.args.exemplars), np.s_[: fits[k], k]
+            exemplars[own] = pairs[self.learn[k].integers(lengths[k], size=drawn), k, each]
+            earlier[own] = self.buffer[k, each, self.learn[k].integers(min(self.visits[k], size), size=drawn)]
+            noise[own] = self.learn[k].standard_normal(noise[own].shape, dtype=np.float32)
         return [torch.from_numpy(array).flatten(1, 2) for array in (exemplars, earlier, noise)]
 
     def remember(self, pairs, lengths):
@@ -374,7 +372,7 @@ def train(args: Args):
 
         # Augment each agent's reward with its own exploration bonus, Eq. 9, after fitting the models; remember the visits.
         pairs = np.concatenate([one_hot[rollout.actions], rollout.all_obs[:-1]], axis=3)  # each agent's u
-        bonus, cross_entropy, overvisited = team.novelty.bonus(pairs, rollout.lengths, fits_after(episode))
+        bonus, cross_entropy, overvisited = team.novelty.bonus(pairs, rollout.lengths)
         augmented = rollout.reward + args.beta * bonus
 
         # Update the selective memory, by the original reward.

@@ -1,14 +1,17 @@
-"""Does learned novelty lag behind? The exploration bonus of the first, tenth and hundredth visit to the same pair.
+"""Does learned novelty lag behind? The exploration bonus of the first, tenth and hundredth visit, and how it follows counts.
 
     python benchmark/novelty.py                          # some minutes; draws docs/novelty.png
 
 Trains each script as it is, at its own defaults, and notes for every trial and window the bonus (before beta) of each visit to
 each pair u. Only pairs that are visited at least `VISITS` times count, so that all visit numbers speak of the same pairs. A
-model that has not begun to learn says nothing yet (EX2's waits for 1000 pairs); visits count from where it does.
+model that has not begun to learn says nothing yet (EX2's waits for 1000 pairs), so pairs that are visited before do not count
+either. The last column is of all pairs in the last quarter of the episodes: the correlation of the bonus with -log n at the nth
+visit to a pair, mean over trials and windows.
 """
 
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
+from itertools import count
 from pathlib import Path
 from unittest.mock import patch
 
@@ -38,27 +41,38 @@ def novelty_class(module):
 
 
 def bonuses_of_visits(method, args):
-    """Train; returns the bonus of the first VISITS visits to each pair that has as many, [pairs, VISITS]."""
-    module, seen = script(method), defaultdict(list)
+    """Train; returns the bonus of the first VISITS visits to each pair that has as many, [pairs, VISITS], and the correlation.
+
+    The bonus of a first visit is nan if the model had learnt nothing then. The correlation is that of the bonus with -log n at
+    the n-th visit to a pair, over the last quarter of the episodes, mean over trials and windows. UsageError without pairs.
+    """
+    module, episode = script(method), count()
     name = novelty_class(module)
+    seen, visits, late = defaultdict(list), Counter(), defaultdict(list)
 
     class Watched(getattr(module, name)):
         def bonus(self, pairs, *rest):
             values, *figures = super().bonus(pairs, *rest)
             (lengths, *_) = rest
+            is_late = next(episode) >= 0.75 * args["num_episodes"]
             for k, length in enumerate(lengths):
-                if not values[:, k].any():
-                    continue  # nothing has been learnt yet
+                learning = values[:, k].any()
                 for w in range(pairs.shape[2]):
                     for pair, value in zip(pairs[:length, k, w], values[:length, k, w], strict=True):
-                        visits = seen[k, w, pair.tobytes()]
-                        if len(visits) < VISITS:
-                            visits.append(value)
+                        key = k, w, pair.tobytes()
+                        visits[key] += 1
+                        if visits[key] <= VISITS:
+                            seen[key].append(value if learning or visits[key] > 1 else np.nan)
+                        if is_late:
+                            late[k, w].append((value, -np.log(visits[key])))
             return values, *figures
 
     with patch.object(module, name, Watched):
         train_aside(module, **args)
-    return np.array([visits for visits in seen.values() if len(visits) == VISITS])
+    bonuses = np.array([values for values in seen.values() if len(values) == VISITS])
+    if not len(bonuses):
+        raise envs.UsageError(f"no pair is visited {VISITS} times by {method} in {args['env']}; train for more episodes.")
+    return bonuses, np.mean([np.corrcoef(*zip(*pairs, strict=True))[0, 1] for pairs in late.values()])
 
 
 def draw(curves, worlds, path):
@@ -100,17 +114,17 @@ def main(
         raise envs.UsageError("--methods and --worlds must name at least one each.")
     for method in methods:
         novelty_class(script(method))
-    curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th"]]
+    curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th", "correlation"]]
     for method in methods:
         for world in worlds:
-            bonuses = curves[method, world] = bonuses_of_visits(
-                method, dict(env=world, num_trials=num_trials, num_episodes=num_episodes)
-            )
-            if not len(bonuses):
-                raise envs.UsageError(f"no pair is visited {VISITS} times by {method} in {world}; train for more episodes.")
-            first, tenth, hundredth = (bonuses[:, n - 1].mean() for n in (1, 10, VISITS))
-            figures = [f"{value:.2f}" for value in (first, tenth, hundredth)]
-            rows.append([method, world, str(len(bonuses)), *figures])
+            args = dict(env=world, num_trials=num_trials, num_episodes=num_episodes)
+            bonuses, correlation = bonuses_of_visits(method, args)
+            bonuses = bonuses[~np.isnan(bonuses[:, 0])]
+            row = [method, world, str(len(bonuses)), *"---"]
+            if len(bonuses):
+                curves[method, world] = bonuses
+                row[3:] = [f"{bonuses[:, n - 1].mean():.2f}" for n in (1, 10, VISITS)]
+            rows.append([*row, f"{correlation:+.2f}"])
     draw(curves, worlds, ROOT / "docs" / "novelty.png")
     print(markdown(rows))
 

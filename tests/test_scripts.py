@@ -384,6 +384,7 @@ BAD_INPUT_OF = {
         "--kl-weight -1": "--kl-weight must be a number of at least 0, not -1",
         "--exemplars 0": "--exemplars must be a number of at least 1, not 0",
         "--buffer-size 0": "--buffer-size must be a number of at least 1, not 0",
+        "--steps-per-fit 0": "--steps-per-fit must be a number of at least 1, not 0",
         "--min-replay 0": "--min-replay must be a number of at least 1, not 0",
     },
     "espg_emi": {
