@@ -36,7 +36,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/spg.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, slots=3),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, slots=3),
+    ("cleaner", "adam"): dict(learning_rate=3e-3, slots=3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, slots=1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, slots=3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, slots=3),
