@@ -41,13 +41,13 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/epg.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, beta=0.03),
-    ("cleaner", "adam"): dict(learning_rate=1e-3, beta=0.03),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.01),
     ("findtreasure", "sign"): dict(learning_rate=3e-4, beta=0.1),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("gotogether", "sign"): dict(learning_rate=3e-4, beta=0.03),
     ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.03),
     ("movebox", "sign"): dict(learning_rate=1e-4, beta=0.03),
-    ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.3),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.3),
     ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, beta=1.0),
 }
