@@ -51,6 +51,7 @@ TUNED = {
     ("gotogether", "adam"): dict(learning_rate=1e-3, exploration=0.2),
     ("movebox", "adam"): dict(learning_rate=3e-4, exploration=0.2),
     ("pushbox", "adam"): dict(learning_rate=3e-4, exploration=0.5),
+    ("climbing", "adam"): dict(learning_rate=3e-4, exploration=0.1),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, exploration=0.2)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the networks learn from rewards divided by this, so from 0.3 to 10
