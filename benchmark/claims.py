@@ -480,8 +480,8 @@ SENTENCES = (
     ),
     Sentence(
         "**EX2, learnt novelty, cannot be told from the Gaussian process** in FindTreasure, GoTogether and, under sign "
-        "descent, PushBox, and beats it there under Adam (DecESPG minus EX2 is {adam}); ICM and EMI keep the large box there in "
-        "{espg_icm} and {espg_emi} trials.",
+        "descent, PushBox, and beats it there under Adam (DecESPG minus EX2 is {adam}); ICM and EMI keep the large box there "
+        "in {espg_icm} and {espg_emi} trials.",
         learnt_novelty,
         lambda f: f["verdicts"] == [*[UNDECIDED] * 5, NO],
     ),
