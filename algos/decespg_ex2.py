@@ -1,20 +1,19 @@
 """DecESPG with the exemplar models EX2 in the place of the Gaussian process (Figure 6 of the paper), on the base of decespg.py.
 
 1. Every agent keeps its pairs u = (o, a). A discriminator D(u*, u) learns to tell an exemplar u* of the episode from earlier
-   pairs; at its optimum D(u, u) = 1 / (1 + p(u)), where p is how often u was visited, and the agent's reward becomes
+   pairs; at its optimum D(u, u) = 1 / (1 + p(u)), where p is the share of u among these, and the agent's reward becomes
    r' = r + beta EB(u) with EB(u) = -log p(u) = log D(u, u) / (1 - D(u, u)).
 2. For every terminal state the team keeps its best episodes; their gradients are added to that of Eq. 14 (Eqs. 15-16).
 
-Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), which gives
-no setting of EX2. Model and loss are those of Fu, Co-Reyes & Levine, "EX2: Exploration with Exemplar Models for Deep
+Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021), which
+gives no setting of EX2. The loss is that of Fu, Co-Reyes & Levine, "EX2: Exploration with Exemplar Models for Deep
 Reinforcement Learning" (NIPS 2017), amortised over exemplars, and of the published code (jcoreyes/ex2): pairs with actions and
--log p as in its pointmass.py, kl_weight as in doom.py, min_replay as in atari.py. That fits 1000 times to 128 exemplars after
-every 4000 steps, at a step size of 1e-4, which would take most of the time here. So the networks are smaller, and there is one
-fit to 32 exemplars for every 20 steps, at 1e-2. With so little fitting two encoders that share nothing hardly tell pairs apart;
-here one reads both, and the classifier sees how far the codes are from each other, too. The kl_weight 0.01 of pointmass.py held
-D at 1/2, which is no bonus at all, and it matters where the networks begin: weights of unit gain, and little noise in the
-codes. The bonus lies in [0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike there its median
-is not subtracted.
+-log p as in its pointmass.py, kl_weight as in doom.py, min_replay as in atari.py. The first two fit 1000 times to 128
+exemplars after every 4000 steps, at a step size of 1e-4, which would take most of the time here. So the networks are smaller,
+and there is one fit to 32 exemplars for every 20 steps, at 1e-2. With so little fitting two encoders, as published, tell pairs
+apart less well than one that reads both, and best if the classifier also sees the absolute difference of the codes' numbers.
+The bonus lies in [0, 11.5], as D is clamped to [1/2, 1 - 1e-5]: below 1/2 it would be negative. Unlike there its median is not
+subtracted.
 
     python algos/decespg_ex2.py --env pushbox --seed 3
 """
@@ -162,7 +161,8 @@ class MaskedAdam:
 class ExemplarDiscriminator:
     """D(u*, u), the probability that u is the exemplar u* itself and not an earlier pair; side by side for all windows.
 
-    One encoder gives the mean and the log variance of a normal code of each. A classifier reads both codes and their distance.
+    One encoder gives the mean and the log variance of a normal code of each. A classifier reads both codes and the absolute
+    difference of each of their numbers.
     """
 
     def __init__(self, generators, nets_per_trial, pair_dim):

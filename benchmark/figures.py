@@ -13,6 +13,7 @@ from envs.drawing import AGENTS
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.backend_bases import FigureCanvasBase
 
 # The colours of Okabe and Ito, which the colour-blind can tell apart, with dashes where they are not enough; always the same.
 COLOURS = {
@@ -43,6 +44,12 @@ FIGURES = {
     "figure6": ("decespg_ex2", "espg_icm", "espg_emi", "gasil", "espg", "decespg"),
     "beyond": (*BESIDE, *BEYOND),
 }
+
+
+def check_picture(path):
+    """UsageError unless a figure can be written to the path, which after hours is too late to learn."""
+    if path.suffix[1:] not in FigureCanvasBase.filetypes or not path.absolute().parent.is_dir():
+        raise envs.UsageError(f"--output must be a picture such as visits.png in a directory that is there, not {path}.")
 
 
 def colour_of(method):

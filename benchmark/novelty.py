@@ -22,7 +22,7 @@ import tyro
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark.cells import METHODS, ROOT, check_words, name_of, script, train_aside
-from benchmark.figures import DASHES, colour_of
+from benchmark.figures import DASHES, check_picture, colour_of
 from benchmark.report import markdown
 from envs.command import command_line
 
@@ -54,7 +54,7 @@ def bonuses_of_visits(method, args):
         def bonus(self, pairs, *rest):
             values, *figures = super().bonus(pairs, *rest)
             (lengths, *_) = rest
-            is_late = next(episode) >= 0.75 * args["num_episodes"]
+            is_late = next(episode) >= 3 * args["num_episodes"] // 4
             for k, length in enumerate(lengths):
                 learning = values[:, k].any()
                 for w in range(pairs.shape[2]):
@@ -88,7 +88,8 @@ def draw(curves, worlds, path):
         axis.set_title(world, fontsize="medium")
         axis.set_xlabel("visit to the same pair")
         axis.set_ylabel("bonus / largest")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center", frameon=False)
+    named = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named.keys(), loc="outside right center", frameon=False)
     figure.savefig(path, dpi=130)
 
 
@@ -97,6 +98,7 @@ def main(
     worlds: tuple[str, ...] = ("findtreasure", "pushbox"),
     num_trials: int = 5,
     num_episodes: int = 1000,
+    output: Path = ROOT / "docs" / "novelty.png",
 ):
     """Train, print a table and draw.
 
@@ -105,6 +107,7 @@ def main(
         worlds: worlds to train in
         num_trials: trials of each script
         num_episodes: episodes of each trial
+        output: file for the figure
     """
     check_words("script", methods, METHODS)
     check_words("world", worlds, envs.WORLDS)
@@ -112,6 +115,7 @@ def main(
         envs.check_whole(name, number, minimum=1)
     if not (methods and worlds):
         raise envs.UsageError("--methods and --worlds must name at least one each.")
+    check_picture(output)
     for method in methods:
         novelty_class(script(method))
     curves, rows = {}, [["script", "world", "pairs", "1st visit", "10th", "100th", "correlation"]]
@@ -125,7 +129,7 @@ def main(
                 curves[method, world] = bonuses
                 row[3:] = [f"{bonuses[:, n - 1].mean():.2f}" for n in (1, 10, VISITS)]
             rows.append([*row, f"{correlation:+.2f}"])
-    draw(curves, worlds, ROOT / "docs" / "novelty.png")
+    draw(curves, worlds, output)
     print(markdown(rows))
 
 

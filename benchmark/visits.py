@@ -12,13 +12,12 @@ from unittest.mock import patch
 import matplotlib
 import numpy as np
 import tyro
-from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.colors import LogNorm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import envs
 from benchmark.cells import BEYOND, METHODS, ROOT, WORLDS, check_words, name_of, script, takes_optimizer, train_aside
-from benchmark.figures import agent_places
+from benchmark.figures import agent_places, check_picture
 from envs.command import command_line
 
 matplotlib.use("Agg")
@@ -99,8 +98,7 @@ def main(
         envs.check_whole(name, number, minimum=1)
     if not (methods and worlds):
         raise envs.UsageError("--methods and --worlds must name at least one each.")
-    if output.suffix[1:] not in FigureCanvasBase.filetypes or not output.absolute().parent.is_dir():  # after hours is too late
-        raise envs.UsageError(f"--output must be a picture such as visits.png in a directory that is there, not {output}.")
+    check_picture(output)
     found = {}
     for method in methods:
         for name in worlds:

@@ -5,6 +5,7 @@ import importlib
 import io
 import itertools
 import json
+import os
 import subprocess
 import sys
 from dataclasses import fields
@@ -322,6 +323,18 @@ def curves(directory):
     events = EventAccumulator(str(directory), size_guidance={"scalars": 0})
     events.Reload()
     return {tag: [(point.step, point.value) for point in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def stop_after(monkeypatch, episode, number):
+    """Let this process get the signal when it records the given episode (1, 2, ...)."""
+    record = run.Run.record
+
+    def interrupted_record(self, now, *args, **figures):
+        record(self, now, *args, **figures)
+        if now + 1 == episode:
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(run.Run, "record", interrupted_record)
 
 
 class Ended(NamedTuple):

@@ -32,6 +32,7 @@ from tests.helpers import (
     contents,
     curves,
     results,
+    stop_after,
     train,
 )
 
@@ -292,18 +293,6 @@ def test_a_saved_team_comes_back_with_everything_that_it_has_learnt(tmp_path):
 
 
 # --- interrupted runs ---
-
-
-def stop_after(monkeypatch, episode, number):
-    """Let this process get the signal when it records the given episode (1, 2, ...)."""
-    record = run.Run.record
-
-    def interrupted_record(self, now, *args, **figures):
-        record(self, now, *args, **figures)
-        if now + 1 == episode:
-            os.kill(os.getpid(), number)
-
-    monkeypatch.setattr(run.Run, "record", interrupted_record)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import ast
 import json
 import random
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import fields
@@ -29,6 +30,7 @@ from tests.helpers import (
     optimizers,
     results,
     script,
+    stop_after,
 )
 
 SOURCES = {f"{name}.py": (ALGOS / f"{name}.py").read_text(encoding="utf-8") for name in SCRIPTS}
@@ -260,22 +262,13 @@ FIGURES = {
 
 @pytest.fixture(scope="module", params=SCRIPTS)
 def interrupted(request, tmp_path_factory):
-    """A run that went through, and one that an exception ended at a random episode after a checkpoint, and that went on."""
+    """A run that went through, and one that was stopped when every model had begun to learn, and that went on."""
     name, folder = request.param, tmp_path_factory.mktemp(request.param)
-    words = [*WORDS, "--log-every", 10, "--save-model", "--checkpoint-every", 0]
+    words = [*WORDS, "--log-every", 10, "--save-model"]
     assert command(name, *words, "--run-dir", folder / "whole").code == 0
-    last = random.Random(name).randrange(3, 40)
-    record = run.Run.record
-
-    def failing_record(self, episode, *args, **figures):
-        if episode == last:
-            raise RuntimeError("on purpose")
-        record(self, episode, *args, **figures)
-
     with pytest.MonkeyPatch.context() as monkeypatch:
-        monkeypatch.setattr(run.Run, "record", failing_record)
-        with pytest.raises(RuntimeError, match="on purpose"):
-            command(name, *words, "--run-dir", folder / "stopped")
+        stop_after(monkeypatch, random.Random(name).randrange(31, 40), signal.SIGTERM)
+        assert command(name, *words, "--run-dir", folder / "stopped").code == 143
     assert not (folder / "stopped" / "episodes.npz").exists()
     ended = command(name, *words, "--run-dir", folder / "stopped", "--resume")
     assert ended.code == 0, ended.err
@@ -289,6 +282,10 @@ def test_a_resumed_run_ends_as_if_nothing_had_happened(interrupted):
     for part in vars(teams[0]):
         for one, other in zip(*(run.arrays_of(getattr(team, part)) for team in teams), strict=True):
             assert one.equal(other), part
+    shown = [curves(folder / which / "seed5") for which in ("stopped", "whole")]
+    for tag, points in shown[1].items():
+        if tag != "charts/SPS":
+            assert shown[0][tag][-1] == points[-1], tag
 
 
 def test_the_curves_are_those_of_the_method(interrupted):

@@ -24,6 +24,7 @@ from tests.helpers import assert_one_sentence
         ("novelty", "--methods pg", "pg.py has no exploration bonus"),
         ("novelty", "--worlds mars", "there is no world 'mars'"),
         ("novelty", "--worlds", "must name at least one"),
+        ("novelty", "--output novelty.txt", "--output must be a picture"),
         ("novelty", "--num-trials 0", "--num-trials must be a whole number of at least 1, not 0"),
         ("novelty", "--num-episodes 1000000000000", "a log of 5 x 1000000000000 episodes would need"),
         ("novelty", "--num-episodes 1 --num-trials 1", "no pair is visited 100 times by decespg in findtreasure"),
