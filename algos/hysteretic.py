@@ -51,7 +51,7 @@ WORLDS = {
 TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, hysteresis=0.2, exploration=0.2),
     ("findtreasure", "adam"): dict(learning_rate=1e-3, hysteresis=0.4, exploration=0.1),
-    ("gotogether", "adam"): dict(learning_rate=1e-3, hysteresis=0.2, exploration=0.2),
+    ("gotogether", "adam"): dict(learning_rate=1e-3, hysteresis=0.2, exploration=0.5),
     ("movebox", "adam"): dict(learning_rate=3e-4, hysteresis=0.2, exploration=0.2),
     ("pushbox", "adam"): dict(learning_rate=3e-4, hysteresis=0.1, exploration=0.5),
     ("climbing", "adam"): dict(learning_rate=3e-3, hysteresis=0.1, exploration=0.1),
