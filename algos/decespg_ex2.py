@@ -84,7 +84,7 @@ class Args(RunArgs):
     buffer_size: Annotated[int, AtLeast(1)] = 20_000
     """steps that are kept for replay"""
     steps_per_fit: Annotated[int, AtLeast(1)] = 20
-    """steps of play for one fit of the discriminators (4 in the published code)"""
+    """steps of play for one fit of the discriminators (4 in the published pointmass.py)"""
     min_replay: Annotated[int, AtLeast(1)] = 1000
     """earlier steps without which the discriminators are not fitted and give no bonus (as in the published atari.py)"""
     slots: Annotated[int | None, AtLeast(0)] = None
