@@ -7,7 +7,7 @@ import numpy as np
 
 import envs
 from benchmark import measures
-from benchmark.cells import BESIDE, BEYOND, OPTIMIZERS, WORLDS, name_of
+from benchmark.cells import BESIDE, BEYOND, METHODS, OPTIMIZERS, WORLDS, name_of
 from benchmark.results import block_of, named_in
 from envs.drawing import AGENTS
 
@@ -19,10 +19,11 @@ from matplotlib.backend_bases import FigureCanvasBase
 COLOURS = {
     **{"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"},
     **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#b3a100", "dqn": "#000000", "edti": "#882255"},
+    **{"decespg_ex2": "#332288", "espg_icm": "#aa4499", "espg_emi": "#44aa99", "gasil": "#117733"},
+    # These never stand beside the four before them.
     **{"hysteretic": "#332288", "ippo": "#44aa99", "mappo": "#117733", "qmix": "#aa4499"},
-    **{"decespg_ex2": "#009e73", "espg_icm": "#d55e00", "espg_emi": "#cc79a7", "gasil": "#e69f00"},
 }
-OTHERS = ("#332288", "#44aa99", "#aa4499", "#999933")  # of scripts that are not the paper's
+OTHERS = ("#8c564b", "#17becf", "#bcbd22", "#e377c2")  # of scripts that are not the paper's
 DASHES = {
     "ac": "--",
     "coma": "--",
@@ -32,7 +33,7 @@ DASHES = {
     "decespg_ex2": "--",
     "espg_icm": "-.",
     "espg_emi": ":",
-    "gasil": "--",
+    "gasil": "-.",
     "hysteretic": "-.",
     "qmix": "--",
     "ippo": "-.",
@@ -62,7 +63,8 @@ def panels(results, methods, ylabel, draw, worlds=None, xlabel="episode"):
     there = {world for world, method, _ in results if method in methods}
     worlds = [world for world in worlds or named_in(results)[0] if world in there]
     rows, columns = len(OPTIMIZERS), len(worlds)
-    figure, axes = plt.subplots(rows, columns, figsize=(3.4 * columns, 2.6 * rows), layout="constrained", squeeze=False)
+    size = (3.4 * columns, 2.6 * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, sharey="col")
     for row, optimizer in enumerate(OPTIMIZERS):
         for axis, world in zip(axes[row], worlds, strict=True):
             found = {method: results[world, method, optimizer] for method in methods if (world, method, optimizer) in results}
@@ -149,7 +151,7 @@ def performance_profiles(profiles, shares):
         axis.grid(alpha=0.3)
     figure.supxlabel("reward per step / optimum, at least", fontsize="medium")
     figure.supylabel("share of trials", fontsize="medium")
-    return with_legend(figure, [method for found in profiles.values() for method in found])
+    return with_legend(figure, METHODS)
 
 
 def intervals(estimates, xlabel):

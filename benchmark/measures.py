@@ -20,6 +20,11 @@ def optimum(world):
         return float("nan")
 
 
+def decimals(world):
+    """Of a reward per step there: 3 where even the optimum is below 1, as in cleaner and gotogether, else 2."""
+    return 3 if optimum(world) < 1 else 2
+
+
 def mean_and_error(values):
     """Mean over trials (the first axis) and its standard error."""
     return values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values))
@@ -33,6 +38,12 @@ def difference(some, others, resamples=10_000):
     differences = some.last - others.last
     draws = np.random.default_rng(0).integers(0, len(differences), (resamples, len(differences)))
     return differences.mean(), *np.quantile(differences[draws].mean(1), (0.025, 0.975))
+
+
+def difference_in_words(some, others, world):
+    """The same in words: +1.23 [+0.45, +2.01]."""
+    mean, low, high = (f"{value:+.{decimals(world)}f}" for value in difference(some, others))
+    return f"{mean} [{low}, {high}]"
 
 
 def reached(result, good, share=0.95):

@@ -60,48 +60,69 @@ class Args:
     """files of your own methods, if they are not in algos/"""
 
 
-def score_table(found):
-    """Reward per step over the last 5 % of the episodes of all results."""
-    rows = [["world", "method"]]
-    for optimizer in OPTIMIZERS:
-        rows[0] += [f"{optimizer}: reward per step", "worst trial", "at best end"]
-    worlds, methods = results.named_in(found)
-    for world in worlds:
-        for method in methods:
-            pair = [found.get((world, method, optimizer)) for optimizer in OPTIMIZERS]
-            if any(pair):
-                words = [word for result in pair for word in scores(world, result)]
-                rows.append([Path(world).stem, name_of(method), *words])
-        if rows[-1][0] == Path(world).stem and np.isfinite(measures.optimum(world)):
-            best = f"*{measures.optimum(world):.2f}*"
-            rows.append([Path(world).stem, "*exact optimum*", best, "", "", best, "", ""])
+def score_table(found, world):
+    """A world's results: reward per step over the last 5 % of the episodes and, if it has outcomes, where the trials end."""
+    columns = ("reward per step", "worst trial", "at best end", "the others")
+    columns = columns if envs.make_world(world).outcome_names else columns[:2]
+    rows = [["method", *(f"{optimizer}: {column}" for optimizer in OPTIMIZERS for column in columns)]]
+    for method in results.named_in(found)[1]:
+        pair = [found.get((world, method, optimizer)) for optimizer in OPTIMIZERS]
+        if any(pair):
+            words = [[*scores(world, result), the_others(world, result)][: len(columns)] for result in pair]
+            rows.append([name_of(method), *words[0], *words[1]])
+    if np.isfinite(measures.optimum(world)):
+        optimum = [f"*{measures.optimum(world):.{measures.decimals(world)}f}*", *[""] * (len(columns) - 1)]
+        rows.append(["*exact optimum*", *optimum, *optimum])
     return rows
 
 
+def score_tables(found):
+    """{world: table} of all worlds of which there are results."""
+    return {world: score_table(found, world) for world in results.named_in(found)[0] if any(world == w for w, *_ in found)}
+
+
 def scores(world, result):
-    """The three columns of one result."""
+    """The mean and error of one result, its worst trial, and how many trials end most often in the best outcome."""
     if result is None:
         return ["", "", ""]
-    mean, error = measures.mean_and_error(result.last)
+    numbers = *measures.mean_and_error(result.last), result.last.min()
+    mean, error, worst = (f"{number:.{measures.decimals(world)}f}" for number in numbers)
     best = envs.make_world(world)
     count = f"{np.sum(result.usual == best.best_outcome)} of {len(result.usual)}" if best.outcome_names else "-"
-    return [f"{mean:.2f} ± {error:.2f}", f"{result.last.min():.2f}", count]
+    return [f"{mean} ± {error}", worst, count]
+
+
+def the_others(world, result):
+    """Where the trials that are not at the best outcome end, and how often, fewest and most, they have met it."""
+    world = envs.make_world(world)
+    if result is None or not world.outcome_names or (best := result.usual == world.best_outcome).all():
+        return ""
+    counts = np.bincount(result.usual[~best], minlength=len(world.outcome_names) + 1)
+    ends = [f"{count} {name}" for count, name in zip(counts, ("time limit", *world.outcome_names), strict=True) if count]
+    met = np.rint(result.at_best[~best].sum(1) * results.block_of(result.num_episodes)).astype(int)
+    return f"{', '.join(ends)}; met {met.min()}" + (f" to {met.max()}" if met.max() > met.min() else "")
 
 
 def best_table(found):
-    """For each world and optimiser the exact optimum, the method that ends best, and DecESPG and PG beside it."""
-    rows = [["world", "exact optimum", "optimiser", "best", "DecESPG", "PG"]]
+    """For each world and optimiser the exact optimum, who ends best, who is level with that method, and DecESPG and PG.
+
+    Level is whose difference of the same seeds has 0 in its 95 % interval.
+    """
+    rows = [["world", "exact optimum", "optimiser", "best", "level with it", "DecESPG", "PG"]]
 
     def words(world, method, optimizer):
         score, _, count = scores(world, found.get((world, method, optimizer)))
         return f"{score} ({count})" if count.strip("-") else score
 
     for world, optimizer in product(WORLDS, OPTIMIZERS):
-        ends = {m: result.last.mean() for (w, m, o), result in found.items() if (w, o) == (world, optimizer)}
-        if len(ends) > 2:
-            best = max(ends, key=ends.get)
+        there = {m: result for (w, m, o), result in found.items() if (w, o) == (world, optimizer)}
+        if len(there) > 2:
+            best = max(there, key=lambda method: there[method].last.mean())
+            level = [m for m in there if m != best and measures.difference(there[best], there[m])[1] <= 0]
             three = [words(world, method, optimizer) for method in (best, "decespg", "pg")]
-            rows.append([world, f"{measures.optimum(world):.2f}", optimizer, f"{name_of(best)} {three[0]}", *three[1:]])
+            optimum = f"{measures.optimum(world):.{measures.decimals(world)}f}"
+            place = [world, optimum, optimizer, f"{name_of(best)} {three[0]}"]
+            rows.append([*place, ", ".join(map(name_of, level)) or "-", *three[1:]])
     return rows
 
 
@@ -130,7 +151,7 @@ def difference_table(found, one="decespg", other="spg"):
     for world in WORLDS:
         pairs = [[found.get((world, method, optimizer)) for method in (one, other)] for optimizer in OPTIMIZERS]
         if any(all(pair) for pair in pairs):
-            words = ["{:+.2f} [{:+.2f}, {:+.2f}]".format(*measures.difference(*pair)) if all(pair) else "" for pair in pairs]
+            words = [measures.difference_in_words(*pair, world) if all(pair) else "" for pair in pairs]
             rows.append([world, *words])
     return rows
 
@@ -279,7 +300,8 @@ def page(found, drawn):
     paper = results.of_the_paper(found)
     there = f"{len(paper)} of {len(select(METHODS, WORLDS, OPTIMIZERS))} cells of the paper's are there"
     parts.append(f"<p>{datetime.now():%Y-%m-%d}: {there}, made with {versions(found)}. {time_needed(found)}</p>")
-    parts += ["<h2>Reward per step, last 5 % of the episodes</h2>", html_table(score_table(found))]
+    parts.append("<h2>Reward per step, last 5 % of the episodes</h2>")
+    parts += [f"<h3>{Path(world).stem}</h3>{html_table(table)}" for world, table in score_tables(found).items()]
     parts += ["<h2>DecESPG minus SPG: what the bonus adds to the memory</h2>", html_table(difference_table(found))]
     parts += ["<h2>Sample efficiency: until 95 % of the trials are there</h2>", html_table(leaderboard(found))]
     for name, figure in drawn.items():
@@ -303,18 +325,17 @@ def publish(found, drawn):
     """Show results in docs/ and in the README."""
     for name, figure in drawn.items():
         figure.savefig(DOCS / f"{name}.png", dpi=130)
-    tables = dict(scores=score_table, differences=difference_table, leaderboard=leaderboard)
     paper, beyond = results.of_the_paper(found), results.beyond_the_paper(found)
-    beyond_tables = dict(scores=score_table, leaderboard=leaderboard)
-    pages = (
-        (README, paper, {"best": best_table}),
-        (DOCS / "results.md", paper, tables),
-        (DOCS / "beyond.md", beyond, beyond_tables),
-    )
-    for path, part, names in pages:
+    others = {"differences": difference_table(paper), "leaderboard": leaderboard(paper)}
+    pages = {
+        README: {"best": best_table(paper)},
+        DOCS / "results.md": score_tables(paper) | others,
+        DOCS / "beyond.md": score_tables(beyond) | {"leaderboard": leaderboard(beyond)},
+    }
+    for path, tables in pages.items():
         text = path.read_text(encoding="utf-8")
-        for name, table in names.items():
-            text = rewrite(text, name, markdown(table(part)))
+        for name, table in tables.items():
+            text = rewrite(text, name, markdown(table))
         path.write_text(text, encoding="utf-8")
 
 
@@ -350,7 +371,8 @@ def main(args: Args):
     if args.publish:
         publish(found, drawn)
     plt.close("all")
-    print(markdown(score_table(found)), markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")
+    tables = [f"{Path(world).stem}\n\n{markdown(table)}" for world, table in score_tables(found).items()]
+    print(*tables, markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")
     print("", f"{time_needed(found)} See {output_dir}.".strip(), sep="\n")
 
 

@@ -115,6 +115,6 @@ def test_worse_with_training_is_a_matter_of_standard_errors():
     found = {("cleaner", method, "sign"): some_result(0.05 + noise, score=np.full((20, 3), 0.11)) for method in ("pg", "coma")}
     words, verdict = claims.worse_with_training(claims.Cells(found, "cleaner", "sign"))
     assert verdict == "yes"
-    assert re.match(r"PG 0.11 in the first 100 episodes, 0.0\d in the end; COMA 0.11 ", words)
+    assert re.match(r"PG 0.110 in the first 100 episodes, 0.0\d\d in the end; COMA 0.110 ", words)
     found["cleaner", "coma", "sign"] = some_result(0.2 + noise, score=np.full((20, 3), 0.11))
     assert claims.worse_with_training(claims.Cells(found, "cleaner", "sign"))[1] == "partly"

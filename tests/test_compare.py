@@ -194,7 +194,7 @@ def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, ca
     assert not results.finished(tmp_path / "runs", num_episodes=100)
     assert "mine.py are left out: it is not in algos/, and --scripts does not name it" in capsys.readouterr().err
     assert found[str(world), "mine", "sign"].actions.any()
-    assert report.score_table(found)[1][:2] == ["race", "mine"]
+    assert report.score_tables(found)[str(world)][1][0] == "mine"
     drawn = figures.learning_curves(found, results.named_in(found)[1])
     assert [axis.get_title() for axis in drawn.axes] == ["race, sign", "race, adam"]
 

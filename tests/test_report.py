@@ -31,11 +31,30 @@ def test_the_published_tables_are_those_of_the_kept_results(kept):
     paper, beyond = results.of_the_paper(kept), results.beyond_the_paper(kept)
     assert report.markdown(report.best_table(paper)) in report.README.read_text(encoding="utf-8")
     text = (report.DOCS / "results.md").read_text(encoding="utf-8")
-    for table in (report.score_table, report.difference_table, report.leaderboard):
-        assert report.markdown(table(paper)) in text
+    for table in (*report.score_tables(paper).values(), report.difference_table(paper), report.leaderboard(paper)):
+        assert report.markdown(table) in text
     text = (report.DOCS / "beyond.md").read_text(encoding="utf-8")
-    for table in (report.score_table, report.leaderboard):
-        assert report.markdown(table(beyond)) in text
+    for table in (*report.score_tables(beyond).values(), report.leaderboard(beyond)):
+        assert report.markdown(table) in text
+
+
+def test_a_world_s_table_tells_where_trials_end(kept):
+    result = dataclasses.replace(
+        kept["pushbox", "spg", "sign"],
+        last=np.full(20, 2.0),
+        usual=np.array([4] * 17 + [0, 1, 1]),
+        at_best=np.r_[np.ones((17, 200)), np.zeros((2, 200)), [[0.07, 0.01, *[0] * 198]]],
+    )
+    head, row, optimum = report.score_table({("pushbox", "spg", "sign"): result}, "pushbox")
+    assert head[:5] == [
+        "method",
+        *(f"sign: {word}" for word in ("reward per step", "worst trial", "at best end", "the others")),
+    ]
+    assert row[:5] == ["SPG", "2.00 ± 0.00", "2.00", "17 of 20", "1 time limit, 2 small left; met 0 to 8"]
+    assert (row[5:], optimum[:2]) == ([""] * 4, ["*exact optimum*", "*33.33*"])
+    head, row, _ = report.score_table({("cleaner", "pg", "sign"): kept["cleaner", "pg", "sign"]}, "cleaner")
+    assert (len(head), len(row)) == (5, 5)  # there is nothing to end in
+    assert re.fullmatch(r"0\.\d{3} ± 0\.\d{3}", row[1])
 
 
 def test_what_is_beyond_the_paper_stands_by_itself(kept):
@@ -69,12 +88,14 @@ def test_the_leaderboard_counts_until_95_percent_are_there(kept):
     assert len(head) == len(row)
 
 
-def test_the_best_of_each_world_is_named(kept):
+def test_the_best_of_each_world_is_named_and_who_is_level_with_it(kept):
     few = {key: kept[key] for key in [("pushbox", m, "sign") for m in ("pg", "spg", "decespg")]}
     few["pushbox", "spg", "sign"] = dataclasses.replace(few["pushbox", "spg", "sign"], last=np.full(20, 33.0))
     _, row = report.best_table(few)
-    assert row[:4] == ["pushbox", "33.33", "sign", "SPG 33.00 ± 0.00 (20 of 20)"]
-    assert row[4].endswith("(20 of 20)")
+    assert row[:5] == ["pushbox", "33.33", "sign", "SPG 33.00 ± 0.00 (20 of 20)", "-"]
+    assert row[5].endswith("(20 of 20)")
+    few["pushbox", "decespg", "sign"] = dataclasses.replace(few["pushbox", "spg", "sign"], last=np.linspace(32, 33.9, 20))
+    assert report.best_table(few)[1][4] == "DecESPG"
 
 
 def test_every_method_has_its_own_look():
@@ -134,7 +155,8 @@ def test_a_smoke_run_has_a_report_of_its_own(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
     report.main(report.Args(runs=tmp_path / "runs", episodes=100, seeds="1-2"))
     said = capsys.readouterr().out
-    assert said.count("| pushbox | ") == 4 + 1  # methods and optimum, and the difference
+    assert said.startswith("pushbox\n\n| method | sign: reward per step |")
+    assert [said.count(f"\n| {name} | ") for name in ("PG", "SPG", "DecESPG", "*exact optimum*", "pushbox")] == [1] * 5
     assert (tmp_path / "report" / "report.html").stat().st_size > 10_000
     assert (tmp_path / "report" / "figure4.png").exists()
     assert [path.read_bytes() for path in paths] == before
