@@ -15,7 +15,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.backend_bases import FigureCanvasBase
 
-# The colours of Okabe and Ito, which the colour-blind can tell apart, with dashes where they are not enough; always the same.
+# The colours of Okabe and Ito, and of Paul Tol, which the colour-blind can tell apart, with dashes; always the same.
 COLOURS = {
     **{"pg": "#777777", "epg": "#009e73", "spg": "#e69f00", "espg": "#56b4e9", "decespg": "#0072b2"},
     **{"ac": "#d55e00", "coma": "#cc79a7", "acer": "#b3a100", "dqn": "#000000", "edti": "#882255"},
@@ -23,7 +23,7 @@ COLOURS = {
     # These never stand beside the four before them.
     **{"hysteretic": "#332288", "ippo": "#44aa99", "mappo": "#117733", "qmix": "#aa4499"},
 }
-OTHERS = ("#8c564b", "#17becf", "#bcbd22", "#e377c2")  # of scripts that are not the paper's
+OTHERS = ("#8c564b", "#e6194b", "#911eb4", "#7fbf3f")  # of your own scripts
 DASHES = {
     "ac": "--",
     "coma": "--",
@@ -54,7 +54,7 @@ def check_picture(path):
 
 
 def colour_of(method):
-    """A method's colour; a script that is not the paper's has the same of OTHERS in every figure."""
+    """A method's colour; a script of your own has the same of OTHERS in every figure."""
     return COLOURS.get(method) or OTHERS[sum(method.encode()) % len(OTHERS)]
 
 

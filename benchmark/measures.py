@@ -20,30 +20,34 @@ def optimum(world):
         return float("nan")
 
 
-def decimals(world):
-    """Of a reward per step there: 3 where even the optimum is below 1, as in cleaner and gotogether, else 2."""
-    return 3 if optimum(world) < 1 else 2
+def in_words(world, value, sign=""):
+    """A reward per step as 1.23, or 0.123 where even the optimum is below 1, as in cleaner; sign "+" shows its sign."""
+    return f"{value:{sign}.{3 if abs(optimum(world)) < 1 else 2}f}"
+
+
+def interval_in_words(world, mean, low, high):
+    """A difference and its interval as +1.23 [+0.45, +2.01]; of one trial there is no interval."""
+    mean, low, high = (in_words(world, value, "+") for value in (mean, low, high))
+    return mean if "nan" in low else f"{mean} [{low}, {high}]"
 
 
 def mean_and_error(values):
-    """Mean over trials (the first axis) and its standard error."""
-    return values.mean(0), values.std(0, ddof=1) / np.sqrt(len(values))
+    """Mean over trials (the first axis) and its standard error, nan of one trial."""
+    mean = values.mean(0)
+    return mean, values.std(0, ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.full_like(mean, np.nan)
 
 
 def difference(some, others, resamples=10_000):
     """Mean difference of two methods' last 5 % and its 95 % bootstrap interval: mean, low, high.
 
-    Trials of the same seed start from the same networks and action draws, so the pairs are resampled.
+    Trials of the same seed start from the same networks and action draws, so the pairs are resampled. One pair has no
+    interval, which is nan then.
     """
     differences = some.last - others.last
+    if len(differences) == 1:
+        return differences[0], np.nan, np.nan
     draws = np.random.default_rng(0).integers(0, len(differences), (resamples, len(differences)))
     return differences.mean(), *np.quantile(differences[draws].mean(1), (0.025, 0.975))
-
-
-def difference_in_words(some, others, world):
-    """The same in words: +1.23 [+0.45, +2.01]."""
-    mean, low, high = (f"{value:+.{decimals(world)}f}" for value in difference(some, others))
-    return f"{mean} [{low}, {high}]"
 
 
 def reached(result, good, share=0.95):

@@ -62,8 +62,8 @@ class Args:
 
 def score_table(found, world):
     """A world's results: reward per step over the last 5 % of the episodes and, if it has outcomes, where the trials end."""
-    columns = ("reward per step", "worst trial", "at best end", "the others")
-    columns = columns if envs.make_world(world).outcome_names else columns[:2]
+    columns = ["reward per step", "worst trial"]
+    columns += ["at best end", "the others"] if envs.make_world(world).best_outcome else []
     rows = [["method", *(f"{optimizer}: {column}" for optimizer in OPTIMIZERS for column in columns)]]
     for method in results.named_in(found)[1]:
         pair = [found.get((world, method, optimizer)) for optimizer in OPTIMIZERS]
@@ -71,7 +71,7 @@ def score_table(found, world):
             words = [[*scores(world, result), the_others(world, result)][: len(columns)] for result in pair]
             rows.append([name_of(method), *words[0], *words[1]])
     if np.isfinite(measures.optimum(world)):
-        optimum = [f"*{measures.optimum(world):.{measures.decimals(world)}f}*", *[""] * (len(columns) - 1)]
+        optimum = [f"*{measures.in_words(world, measures.optimum(world))}*", *[""] * (len(columns) - 1)]
         rows.append(["*exact optimum*", *optimum, *optimum])
     return rows
 
@@ -86,27 +86,31 @@ def scores(world, result):
     if result is None:
         return ["", "", ""]
     numbers = *measures.mean_and_error(result.last), result.last.min()
-    mean, error, worst = (f"{number:.{measures.decimals(world)}f}" for number in numbers)
-    best = envs.make_world(world)
-    count = f"{np.sum(result.usual == best.best_outcome)} of {len(result.usual)}" if best.outcome_names else "-"
-    return [f"{mean} ± {error}", worst, count]
+    mean, error, worst = (measures.in_words(world, number) for number in numbers)
+    best, trials = envs.make_world(world).best_outcome, len(result.usual)
+    return [f"{mean} ± {error}" if trials > 1 else mean, worst, f"{np.sum(result.usual == best)} of {trials}" if best else "-"]
 
 
-def the_others(world, result):
-    """Where the trials that are not at the best outcome end, and how often, fewest and most, they have met it."""
-    world = envs.make_world(world)
-    if result is None or not world.outcome_names or (best := result.usual == world.best_outcome).all():
+def the_others(name, result):
+    """Where the trials that are not at the best outcome end, and how many of them have met it, and how often."""
+    world = envs.make_world(name)
+    if result is None or not world.best_outcome:
         return ""
-    counts = np.bincount(result.usual[~best], minlength=len(world.outcome_names) + 1)
-    ends = [f"{count} {name}" for count, name in zip(counts, ("time limit", *world.outcome_names), strict=True) if count]
-    met = np.rint(result.at_best[~best].sum(1) * results.block_of(result.num_episodes)).astype(int)
-    return f"{', '.join(ends)}; met {met.min()}" + (f" to {met.max()}" if met.max() > met.min() else "")
+    others = result.usual != world.best_outcome
+    if not others.any():
+        return ""
+    counts = np.bincount(result.usual[others], minlength=len(world.outcome_names) + 1)
+    ends = [f"{end}: {count}" for end, count in zip(("time limit", *world.outcome_names), counts, strict=True) if count]
+    times = np.rint(result.at_best[others].sum(1) * results.block_of(result.num_episodes)).astype(int)
+    often = "once" if times.max() == 1 else f"up to {times.max()} times"
+    met = "all" if times.all() else np.sum(times > 0) or "none"
+    return f"{', '.join(ends)}; {met} met it" + (f", {often}" if times.any() else "")
 
 
 def best_table(found):
     """For each world and optimiser the exact optimum, who ends best, who is level with that method, and DecESPG and PG.
 
-    Level is whose difference of the same seeds has 0 in its 95 % interval.
+    A method is level with the best if the 95 % interval of their difference (`measures.difference`) has 0 in it.
     """
     rows = [["world", "exact optimum", "optimiser", "best", "level with it", "DecESPG", "PG"]]
 
@@ -118,10 +122,9 @@ def best_table(found):
         there = {m: result for (w, m, o), result in found.items() if (w, o) == (world, optimizer)}
         if len(there) > 2:
             best = max(there, key=lambda method: there[method].last.mean())
-            level = [m for m in there if m != best and measures.difference(there[best], there[m])[1] <= 0]
+            level = [m for m in there if m != best and not measures.difference(there[best], there[m])[1] > 0]
             three = [words(world, method, optimizer) for method in (best, "decespg", "pg")]
-            optimum = f"{measures.optimum(world):.{measures.decimals(world)}f}"
-            place = [world, optimum, optimizer, f"{name_of(best)} {three[0]}"]
+            place = [world, measures.in_words(world, measures.optimum(world)), optimizer, f"{name_of(best)} {three[0]}"]
             rows.append([*place, ", ".join(map(name_of, level)) or "-", *three[1:]])
     return rows
 
@@ -151,8 +154,8 @@ def difference_table(found, one="decespg", other="spg"):
     for world in WORLDS:
         pairs = [[found.get((world, method, optimizer)) for method in (one, other)] for optimizer in OPTIMIZERS]
         if any(all(pair) for pair in pairs):
-            words = [measures.difference_in_words(*pair, world) if all(pair) else "" for pair in pairs]
-            rows.append([world, *words])
+            differences = [measures.difference(*pair) if all(pair) else None for pair in pairs]
+            rows.append([world, *(measures.interval_in_words(world, *each) if each else "" for each in differences)])
     return rows
 
 
@@ -314,29 +317,36 @@ def page(found, drawn):
 
 
 def rewrite(text, name, table):
-    """Put a table between the marks <!-- name --> and <!-- end name --> of a text."""
-    marks = f"<!-- {name} -->", f"<!-- end {name} -->"
-    before, _, rest = text.partition(marks[0])
-    _, _, after = rest.partition(marks[1])
-    return f"{before}{marks[0]}\n{table}\n{marks[1]}{after}"
+    """Put a table between the marks <!-- name --> and <!-- end name --> of a text; UsageError if it has not one of each."""
+    first, last = f"<!-- {name} -->", f"<!-- end {name} -->"
+    if (text.count(first), text.count(last)) != (1, 1):
+        raise envs.UsageError(f"the place of a table must be marked by one {first} and one {last}.")
+    before, rest = text.split(first)
+    return f"{before}{first}\n{table}\n{last}{rest.split(last)[1]}"
+
+
+def published_tables(found):
+    """{page: {mark: table}} of all that docs/ and the README show; a world of your own has no place there."""
+    paper, beyond = results.of_the_paper(found), results.beyond_the_paper(found)
+    of_worlds = {world: table for world, table in score_tables(paper).items() if world in WORLDS}
+    return {
+        README: {"best": best_table(paper)},
+        DOCS / "results.md": {**of_worlds, "differences": difference_table(paper), "leaderboard": leaderboard(paper)},
+        DOCS / "beyond.md": {**score_tables(beyond), "leaderboard": leaderboard(beyond)},
+    }
 
 
 def publish(found, drawn):
     """Show results in docs/ and in the README."""
+    pages = published_tables(found)
+    texts = {page: page.read_text(encoding="utf-8") for page in pages}
+    for page, tables in pages.items():
+        for mark, table in tables.items():
+            texts[page] = rewrite(texts[page], mark, markdown(table))
+    for page, text in texts.items():
+        page.write_text(text, encoding="utf-8")
     for name, figure in drawn.items():
         figure.savefig(DOCS / f"{name}.png", dpi=130)
-    paper, beyond = results.of_the_paper(found), results.beyond_the_paper(found)
-    others = {"differences": difference_table(paper), "leaderboard": leaderboard(paper)}
-    pages = {
-        README: {"best": best_table(paper)},
-        DOCS / "results.md": score_tables(paper) | others,
-        DOCS / "beyond.md": score_tables(beyond) | {"leaderboard": leaderboard(beyond)},
-    }
-    for path, tables in pages.items():
-        text = path.read_text(encoding="utf-8")
-        for name, table in tables.items():
-            text = rewrite(text, name, markdown(table))
-        path.write_text(text, encoding="utf-8")
 
 
 def refuse(message):

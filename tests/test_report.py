@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+import envs
 from benchmark import figures, report, results
 from benchmark.cells import BEYOND, METHODS, Cell
 from tests.helpers import BEST_PLANS, assert_refused, script, train
@@ -28,33 +29,67 @@ def test_the_published_tables_are_those_of_the_kept_results(kept):
     for (world, method, _), result in kept.items():
         assert result.num_episodes == script(method).WORLDS[world]["num_episodes"]
     assert all(len(result.about["commit"]) == 40 for result in kept.values())
-    paper, beyond = results.of_the_paper(kept), results.beyond_the_paper(kept)
-    assert report.markdown(report.best_table(paper)) in report.README.read_text(encoding="utf-8")
-    text = (report.DOCS / "results.md").read_text(encoding="utf-8")
-    for table in (*report.score_tables(paper).values(), report.difference_table(paper), report.leaderboard(paper)):
-        assert report.markdown(table) in text
-    text = (report.DOCS / "beyond.md").read_text(encoding="utf-8")
-    for table in (*report.score_tables(beyond).values(), report.leaderboard(beyond)):
-        assert report.markdown(table) in text
+    for page, tables in report.published_tables(kept).items():
+        text = page.read_text(encoding="utf-8")
+        for mark, table in tables.items():
+            assert report.rewrite(text, mark, report.markdown(table)) == text, (page.name, mark)
 
 
-def test_a_world_s_table_tells_where_trials_end(kept):
-    result = dataclasses.replace(
-        kept["pushbox", "spg", "sign"],
-        last=np.full(20, 2.0),
-        usual=np.array([4] * 17 + [0, 1, 1]),
-        at_best=np.r_[np.ones((17, 200)), np.zeros((2, 200)), [[0.07, 0.01, *[0] * 198]]],
-    )
+def test_a_table_without_a_place_is_refused_before_anything_is_written(kept, tmp_path, monkeypatch):
+    for name, path in (("README", report.README), ("results.md", report.DOCS / "results.md")):
+        (tmp_path / name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "beyond.md").write_text("<!-- leaderboard -->\nno end", encoding="utf-8")
+    monkeypatch.setattr(report, "README", tmp_path / "README")
+    monkeypatch.setattr(report, "DOCS", tmp_path)
+    before = [path.read_bytes() for path in sorted(tmp_path.iterdir())]
+    with pytest.raises(envs.UsageError, match="must be marked by one <!-- leaderboard --> and one <!-- end leaderboard -->"):
+        report.publish({key: kept[key] for key in [("pushbox", "pg", "sign")]}, {"figure4": None})
+    assert [path.read_bytes() for path in sorted(tmp_path.iterdir())] == before
+
+
+def ended(kept, usual, met, num_episodes=20_000):
+    """20 trials in pushbox that usually end as `usual` says; the last of them have `met` the large box so often."""
+    at_best = np.zeros((20, 200))
+    at_best[20 - len(met) :, 0] = np.array(met) / results.block_of(num_episodes)
+    parts = dict(last=np.full(20, 2.0), usual=np.array(usual), at_best=at_best, num_episodes=num_episodes)
+    return dataclasses.replace(kept["pushbox", "spg", "sign"], **parts)
+
+
+def test_a_worlds_table_tells_where_trials_end(kept):
+    result = ended(kept, [4] * 17 + [0, 1, 1], met=[0, 0, 8])
     head, row, optimum = report.score_table({("pushbox", "spg", "sign"): result}, "pushbox")
-    assert head[:5] == [
-        "method",
-        *(f"sign: {word}" for word in ("reward per step", "worst trial", "at best end", "the others")),
-    ]
-    assert row[:5] == ["SPG", "2.00 ± 0.00", "2.00", "17 of 20", "1 time limit, 2 small left; met 0 to 8"]
+    assert head[1:5] == [f"sign: {word}" for word in ("reward per step", "worst trial", "at best end", "the others")]
+    assert row[:5] == ["SPG", "2.00 ± 0.00", "2.00", "17 of 20", "time limit: 1, small left: 2; 1 met it, up to 8 times"]
     assert (row[5:], optimum[:2]) == ([""] * 4, ["*exact optimum*", "*33.33*"])
     head, row, _ = report.score_table({("cleaner", "pg", "sign"): kept["cleaner", "pg", "sign"]}, "cleaner")
     assert (len(head), len(row)) == (5, 5)  # there is nothing to end in
     assert re.fullmatch(r"0\.\d{3} ± 0\.\d{3}", row[1])
+
+
+@pytest.mark.parametrize(
+    ("usual", "met", "episodes", "said"),
+    [
+        ([4] * 20, [], 20_000, ""),
+        ([4] * 18 + [2, 2], [0, 0], 20_000, "small right: 2; none met it"),
+        ([4] * 18 + [2, 2], [5, 3], 20_000, "small right: 2; all met it, up to 5 times"),
+        ([4] * 19 + [3], [7], 20_000, "both small: 1; all met it, up to 7 times"),
+        ([4] * 18 + [1, 0], [1, 0], 20_000, "time limit: 1, small left: 1; 1 met it, once"),
+        ([4] * 19 + [3], [2], 100, "both small: 1; all met it, up to 2 times"),  # blocks of 5 episodes
+    ],
+)
+def test_the_others_are_those_not_at_the_best_outcome(usual, met, episodes, said, kept):
+    assert report.the_others("pushbox", ended(kept, usual, met, episodes)) == said
+
+
+def test_of_one_trial_there_is_no_error_and_no_interval(kept, recwarn):
+    one = {}
+    for method in ("spg", "decespg"):
+        result = kept["pushbox", method, "sign"]
+        parts = {name: getattr(result, name)[:1] for name in ("score", "at_best", "steps", "last", "usual")}
+        one["pushbox", method, "sign"] = dataclasses.replace(result, **parts)
+    assert re.fullmatch(r"\d+\.\d\d", report.score_table(one, "pushbox")[1][1])
+    assert re.fullmatch(r"[+-]\d\.\d\d", report.difference_table(one)[1][1])
+    assert not recwarn
 
 
 def test_what_is_beyond_the_paper_stands_by_itself(kept):
@@ -101,6 +136,16 @@ def test_the_best_of_each_world_is_named_and_who_is_level_with_it(kept):
 def test_every_method_has_its_own_look():
     looks = {(figures.COLOURS[method], figures.DASHES.get(method, "-")) for method in METHODS | BEYOND}
     assert len(looks) == len(METHODS | BEYOND)
+    assert len({figures.COLOURS[method] for method in METHODS}) == len(METHODS)  # dots with intervals have no dashes
+
+
+def test_panels_of_a_world_have_one_scale_and_a_legend_names_all_profiles(kept):
+    drawn = figures.learning_curves({key: kept[key] for key in kept if key[0] == "cleaner" and key[1] == "pg"}, ("pg",))
+    assert drawn.axes[0].get_ylim() == drawn.axes[1].get_ylim()
+    shares = np.linspace(0, 1, 3)
+    profiles = {"sign": {"pg": 3 * (shares,)}, "adam": {"dqn": 3 * (shares,), "pg": 3 * (shares,)}}
+    (legend,) = figures.performance_profiles(profiles, shares).legends
+    assert [text.get_text() for text in legend.get_texts()] == ["PG", "DQN"]
 
 
 def test_curves_show_mean_error_and_optimum(kept):
