@@ -327,7 +327,8 @@ def overall(claim, rows):
     seen = set(verdicts.values()) - {OPEN}
     alike = {YES: "reproduced", NO: "not reproduced", UNDECIDED: "undecided", PARTLY: "partly"}
     if len(seen) == 1:
-        word = alike[seen.pop()]
+        decided = [optimizer for optimizer in OPTIMIZERS if verdicts[optimizer] != OPEN]
+        word = alike[seen.pop()] + (f" under {decided[0]}" if len(decided) == 1 else "")
     elif YES in seen and PARTLY not in seen:
         word = f"only under {next(o for o in OPTIMIZERS if verdicts[o] == YES)}"
     else:
