@@ -99,8 +99,8 @@ def the_others(name, result):
     others = result.usual != world.best_outcome
     if not others.any():
         return ""
-    counts = np.bincount(result.usual[others], minlength=len(world.outcome_names) + 1)
-    ends = [f"{end}: {count}" for end, count in zip(("time limit", *world.outcome_names), counts, strict=True) if count]
+    names = dict(enumerate(("time limit", *world.outcome_names)))  # a result may know outcomes that its world has no longer
+    ends = [f"{names.get(k, f'outcome {k}')}: {count}" for k, count in enumerate(np.bincount(result.usual[others])) if count]
     times = np.rint(result.at_best[others].sum(1) * results.block_of(result.num_episodes)).astype(int)
     often = "once" if times.max() == 1 else f"up to {times.max()} times"
     met = "all" if times.all() else np.sum(times > 0) or "none"

@@ -74,6 +74,7 @@ def test_a_worlds_table_tells_where_trials_end(kept):
         ([4] * 18 + [2, 2], [5, 3], 20_000, "small right: 2; all met it, up to 5 times"),
         ([4] * 19 + [3], [7], 20_000, "both small: 1; all met it, up to 7 times"),
         ([4] * 18 + [1, 0], [1, 0], 20_000, "time limit: 1, small left: 1; 1 met it, once"),
+        ([4] * 19 + [5], [0], 20_000, "outcome 5: 1; none met it"),  # of a world that has changed since
         ([4] * 19 + [3], [2], 100, "both small: 1; all met it, up to 2 times"),  # blocks of 5 episodes
     ],
 )
