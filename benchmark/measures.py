@@ -27,8 +27,8 @@ def in_words(world, value, sign=""):
 
 def interval_in_words(world, mean, low, high):
     """A difference and its interval as +1.23 [+0.45, +2.01]; of one trial there is no interval."""
-    mean, low, high = (in_words(world, value, "+") for value in (mean, low, high))
-    return mean if "nan" in low else f"{mean} [{low}, {high}]"
+    words = in_words(world, mean, "+")
+    return words if np.isnan(low) else f"{words} [{in_words(world, low, '+')}, {in_words(world, high, '+')}]"
 
 
 def mean_and_error(values):

@@ -122,7 +122,8 @@ def best_table(found):
         there = {m: result for (w, m, o), result in found.items() if (w, o) == (world, optimizer)}
         if len(there) > 2:
             best = max(there, key=lambda method: there[method].last.mean())
-            level = [m for m in there if m != best and not measures.difference(there[best], there[m])[1] > 0]
+            above = {m: measures.difference(there[best], there[m])[1] > 0 for m in there if m != best}  # False of one trial
+            level = [method for method, is_above in above.items() if not is_above]
             three = [words(world, method, optimizer) for method in (best, "decespg", "pg")]
             place = [world, measures.in_words(world, measures.optimum(world)), optimizer, f"{name_of(best)} {three[0]}"]
             rows.append([*place, ", ".join(map(name_of, level)) or "-", *three[1:]])

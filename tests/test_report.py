@@ -17,6 +17,12 @@ def kept():
     return results.kept()
 
 
+@pytest.fixture(autouse=True)
+def closed_figures():
+    yield
+    figures.plt.close("all")
+
+
 def test_tables_are_written_between_their_marks():
     readme = "a\n<!-- scores -->\nold\n<!-- end scores -->\nb\n<!-- other -->\n<!-- end other -->"
     once = report.rewrite(readme, "scores", "new")
@@ -35,12 +41,16 @@ def test_the_published_tables_are_those_of_the_kept_results(kept):
             assert report.rewrite(text, mark, report.markdown(table)) == text, (page.name, mark)
 
 
-def test_a_table_without_a_place_is_refused_before_anything_is_written(kept, tmp_path, monkeypatch):
-    for name, path in (("README", report.README), ("results.md", report.DOCS / "results.md")):
-        (tmp_path / name).write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
-    (tmp_path / "beyond.md").write_text("<!-- leaderboard -->\nno end", encoding="utf-8")
-    monkeypatch.setattr(report, "README", tmp_path / "README")
+def test_tables_are_published_and_one_without_a_place_is_refused_before_anything_is_written(kept, tmp_path, monkeypatch):
+    pages = [report.README, report.DOCS / "results.md", report.DOCS / "beyond.md"]
+    monkeypatch.setattr(report, "README", tmp_path / "README.md")
     monkeypatch.setattr(report, "DOCS", tmp_path)
+    for page in pages:
+        text = page.read_text(encoding="utf-8").replace("| PG |", "| old |").replace("| sign |", "| old |")
+        (tmp_path / page.name).write_text(text, encoding="utf-8")
+    report.publish(kept, {})
+    assert [(tmp_path / page.name).read_bytes() for page in pages] == [page.read_bytes() for page in pages]
+    (tmp_path / "beyond.md").write_text("<!-- leaderboard -->\nno end", encoding="utf-8")
     before = [path.read_bytes() for path in sorted(tmp_path.iterdir())]
     with pytest.raises(envs.UsageError, match="must be marked by one <!-- leaderboard --> and one <!-- end leaderboard -->"):
         report.publish({key: kept[key] for key in [("pushbox", "pg", "sign")]}, {"figure4": None})
