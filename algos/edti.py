@@ -13,12 +13,13 @@ these, because what c_ij weighs is the value of o_j to agent j, and because the 
 local (Jiang & Amato, SAC 2021); it does not say on which learner EDTI ran.
 
 rhat is that of the published code (TonghanWang/EITI-EDTI, Curiosity.py and ppo2/runner.py: count-based probabilities and the
-option --r_tv, which README.md says is EDTI). The weights are those of README.txt's command for the task Pass, the only ones
-published; it names the shares, too, though it runs --tv, which leaves them out. Without shares, with these and with share_int 1
-five teams of an earlier version, with one-step errors, end in findtreasure at 5.4, 6.5 and 7.0 (sign) or 6.9, 4.5 and 7.3
-(adam), each +- 1 to 2. That of r only makes it count more, because r is the team's. The reward of Pass is 1000 and u adds to r,
-so eta is scaled by the world's largest reward / 1000. The other weights are not: they and c have no unit, and V^ext and V^int
-have that of r and u. Unlike there, nothing follows the step that terminates an episode, and PPO gives way to ac.py's update.
+option --r_tv, which README.md says is EDTI). The weights are those of README.txt's command for the task Pass; those of the
+paper's Table 2 were not to be had. It names the shares, too, though it runs --tv, which leaves them out. Without shares, with
+these and with share_int 1 five teams of an earlier version, with one-step errors, ended in findtreasure at 5.4, 6.5 and 7.0
+(sign) or 6.9, 4.5 and 7.3 (adam), each +- 1 to 2. share_ext only makes r count more, because r is the team's. The reward of
+Pass is 1000 and u adds to r, so eta is scaled by the world's largest reward / 1000. The other weights are not: they and c have
+no unit, and V^ext and V^int have that of r and u. Unlike there, nothing follows the step that terminates an episode, and PPO
+gives way to ac.py's update.
 
     python algos/edti.py --env pushbox --num-trials 20
 """
@@ -51,16 +52,16 @@ WORLDS = {
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/edti.csv); guesses where it has no row yet.
 TUNED = {
-    ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=10.0),
-    ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=30.0),
-    ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
-    ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("cleaner", "sign"): dict(learning_rate=1e-4, eta=10.0),
+    ("cleaner", "adam"): dict(learning_rate=1e-3, eta=10.0),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, eta=30.0),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, eta=10.0),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, eta=3.0),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, eta=10.0),
+    ("movebox", "sign"): dict(learning_rate=1e-4, eta=30.0),
+    ("movebox", "adam"): dict(learning_rate=1e-3, eta=10.0),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, eta=30.0),
+    ("pushbox", "adam"): dict(learning_rate=3e-3, eta=10.0),
     ("climbing", "sign"): dict(learning_rate=1e-3, eta=3.0),
     ("climbing", "adam"): dict(learning_rate=3e-3, eta=3.0),
     ("passage", "sign"): dict(learning_rate=1e-3, eta=30.0),
@@ -68,7 +69,7 @@ TUNED = {
     ("secretroom", "sign"): dict(learning_rate=1e-3, eta=10.0),
     ("secretroom", "adam"): dict(learning_rate=3e-3, eta=30.0),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, eta=10.0)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critics learn from rewards divided by this, so from 0.3 to 10; their curves are in units of reward
 
 
@@ -82,8 +83,8 @@ class Args(RunArgs):
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
-    critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
+    critic_learning_rate: Annotated[float, AtLeast(0)] = 3e-3
+    """step size of critics, which always have a persistent Adam (chosen here; ac.py's is tuned)"""
     gae_lambda: Annotated[float, Between(0, 1)] = 0.95
     """lambda of the advantages: 0 looks one step ahead, 1 to the end of the episode (Schulman et al., 2016)"""
     eta: Annotated[float | None, AtLeast(0)] = None

@@ -16,8 +16,9 @@ for continuous actions rewards diversity instead). What has to be chosen here:
   per agent, as its place has (there 2 for one agent).
 - There, 3 epochs of minibatches of 512 follow every 100 000 steps of play. Here an episode may have 3 steps, of which a
   covariance is singular and no marginal can be had. So minibatches of 64 are drawn from the last 4000 steps, the first when 64
-  have been seen: one after each of the first 1000 episodes, which in findtreasure and pushbox last 19 and 27 steps (under sign
-  descent), and one after every fifth of the others, of 9 and 5 steps. So every step of play is used 1.4 to 3.4 times.
+  have been seen: one after each of the first 1000 episodes and one after every fifth of the others. A step of play is used
+  about twice in findtreasure and pushbox and less where episodes are long, 0.2, 0.08 and 0.02 times in movebox, cleaner and
+  gotogether. Minibatches by the step, so that each is used three times, do not help there (see the method's page).
 - These are fewer steps of Adam, so they are 0.003 long (there 0.001): under random play in findtreasure ||e||^2 comes to rest
   after 250 of them instead of 700, at the same value.
 - w_S leaves S about 1 % of what phi and psi cannot say, so steps into a wall or a teammate go on to earn a bonus.
@@ -93,7 +94,7 @@ class Args(RunArgs):
     gaussian_weight: Annotated[float, AtLeast(0)] = 0.5
     """w_KL of the divergence of psi(a) from the unit Gaussian (the published code's)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned in spg.py; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: spg.py's is tuned; else 3 in cleaner and movebox, 10 elsewhere)"""
 
 
 class StackedMLP:
@@ -190,7 +191,7 @@ def squared_residual(phi, psi, next_phi, error):
 
 
 def learns_after(episode):
-    """Whether the model learns after an episode: always while the teams still explore, whose episodes are long."""
+    """Whether the model learns after an episode: always at first, while teams explore."""
     return episode < 1000 or episode % 5 == 0
 
 

@@ -15,9 +15,9 @@ never from stored actions, as in Guo et al., "Generative Adversarial Self-Imitat
   episodes do not age (in the code their return falls by 0.01 in every episode, which belongs to its scale of reward): these
   worlds are deterministic, so a success is never luck.
 - Episodes are kept, and their steps drawn, for the team: all agents' discriminators see the same good steps.
-- D has an output for each action, ReLU and no layer normalisation. After each episode it makes one step, with this episode
-  in the place of the last 32 and without the task to tell stored actions from the policy's in the same observations. All
-  steps count the same, as in the code after the rise.
+- D has an output for each action, ReLU and no layer normalisation. After each episode it makes one step of Adam, on this
+  episode where the code takes its last 32. The code's second task, to tell stored actions from the policy's own in the same
+  observations, is left out. All steps weigh the same, as in the code once its weight kappa has reached 1.
 As in the code, whole episodes are kept; the paper's sub-curriculum is left out.
 
     python algos/gasil.py --env pushbox --seed 3

@@ -62,9 +62,11 @@ def path_of(method):
 @cache
 def script(method):
     """A script as a module; UsageError if it cannot be imported or is none."""
-    path = path_of(method)
+    path, shipped = path_of(method), ROOT / "algos"
+    if path.parent != shipped and (shipped / path.name).exists():
+        raise envs.UsageError(f"{path} needs another name than algos/{path.name}, so that their results can be told apart.")
     try:
-        if path.parent == ROOT / "algos":
+        if path.parent == shipped:
             module = importlib.import_module(f"algos.{path.stem}")
         else:
             spec = importlib.util.spec_from_file_location(path.stem, path)
@@ -207,10 +209,12 @@ def seconds_of(run_dir):
 
 
 def seeds_of(text):
-    """(first, last) of "1-20", or of "1"; None if the text is something else."""
+    """(first, last) of "1-20", or of "1"; UsageError if the text is something else."""
     found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", text)
     seeds = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
-    return seeds if seeds[0] <= seeds[1] else None
+    if seeds[0] > seeds[1]:
+        raise envs.UsageError(f"--seeds must be two numbers such as 1-20, not {text!r}.")
+    return seeds
 
 
 def settings_of(run_dir):

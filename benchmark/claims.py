@@ -504,7 +504,12 @@ def main(publish: bool = False):
         print(f'\nSection {claim.section}: "{claim.quote}": {overall(claim, rows)}')
         for world, optimizer, words, verdict in rows:
             print(f"    {world}, {optimizer}: {verdict}{': ' * bool(words)}{words}")
-    wrong = [sentence for sentence in SENTENCES if not sentence.holds(sentence.figures(found))]
+    try:
+        wrong = [sentence for sentence in SENTENCES if not sentence.holds(sentence.figures(found))]
+    except KeyError as error:
+        raise envs.UsageError(
+            f"the README's sentences need {'/'.join(error.args[0])}, which is not in {results.STORE}."
+        ) from error
     for sentence in SENTENCES:
         holds = "NOT TRUE" if sentence in wrong else "true"
         print(f"\n{holds}: {sentence.with_figures(found)}")

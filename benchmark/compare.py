@@ -159,6 +159,8 @@ class Job:
                 # The script inherits the lock: should this runner die, nobody else starts the cell while the script goes on.
                 kinds = dict(stdout=log, stderr=log, cwd=ROOT, env={**os.environ, **told}, pass_fds=[lock.fileno()])
                 self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, **kinds)
+            if self.stopped:  # while the process was being made, when there was nobody to tell
+                self.process.send_signal(signal.SIGTERM)
             self.code = self.process.wait()
             self.seconds = time.monotonic() - start
             before = seconds_of(cell.run_dir) if resume else 0.0
@@ -239,18 +241,13 @@ def clock(seconds):
     return f"{int(seconds) // 3600}:{int(seconds) // 60 % 60:02d}:{int(seconds) % 60:02d}"
 
 
-def refuse(message):
-    """End with one sentence and code 2."""
-    raise envs.UsageError(message)
-
-
 def jobs_of(args):
     """How many cells run at the same time."""
     if args.jobs is not None:
         return envs.check_whole("--jobs", args.jobs, minimum=1)
     text = os.environ.get("JOBS") or str(os.cpu_count() or 1)
     if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) < 1:
-        refuse(f"the variable JOBS must be a whole number of at least 1, not {text!r}.")
+        raise envs.UsageError(f"the variable JOBS must be a whole number of at least 1, not {text!r}.")
     return int(text)
 
 
@@ -258,22 +255,23 @@ def selection(args):
     """The cells that the arguments select."""
     for word in args.algos:
         if not path_of(word).is_file():
-            refuse(f"there is no script {word!r}; there is {', '.join(METHODS | BEYOND)}, or a file such as my_method.py.")
+            others = ", ".join(METHODS | BEYOND)
+            raise envs.UsageError(f"there is no script {word!r}; there is {others}, or a file such as my_method.py.")
     for word in args.envs:
         if word not in envs.WORLDS and not (word.endswith(".py") and Path(word).is_file()):
-            refuse(f"there is no world {word!r}; there is {', '.join(envs.WORLDS)}, or a file such as my_world.py.")
-    if not (seeds := seeds_of(args.seeds)):
-        refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
+            others = ", ".join(envs.WORLDS)
+            raise envs.UsageError(f"there is no world {word!r}; there is {others}, or a file such as my_world.py.")
+    seeds = seeds_of(args.seeds)
     if args.episodes is not None:
         envs.check_whole("--episodes", args.episodes, minimum=1)
     envs.check_number("--checkpoint-every", args.checkpoint_every, lowest=0)
     if args.runs.exists() and not args.runs.is_dir():
-        refuse(f"--runs must be a directory, which {args.runs} is not.")
+        raise envs.UsageError(f"--runs must be a directory, which {args.runs} is not.")
     block = dict(first_seed=seeds[0], num_trials=seeds[1] - seeds[0] + 1, num_episodes=args.episodes, runs=args.runs.absolute())
     cells = select(args.algos, args.envs, args.optimizers, env_args=args.env_args, **block)
     cells = [dataclasses.replace(cell, own=own) for cell in cells for own in combinations(args.args)]
     if not cells:
-        refuse("nothing is selected; methods without --optimizer, Q-learning and PPO, are run under adam only.")
+        raise envs.UsageError("nothing is selected; methods without --optimizer, Q-learning and PPO, are run under adam only.")
     for cell in cells:
         cell.settings  # noqa: B018 - what is impossible is said before anything runs
     return cells
@@ -285,9 +283,9 @@ def combinations(words):
     for word in words:
         name, equals, values = word.partition("=")
         if not equals or not re.fullmatch(r"[a-z_]+", name) or not all(values.split(",")):
-            refuse(f"--args must be written argument=value or argument=value,value, not {word!r}.")
+            raise envs.UsageError(f"--args must be written argument=value or argument=value,value, not {word!r}.")
         if name in (*TOLD, *HOUSEKEEPING):
-            refuse(f"--args must be arguments of the method, which {name!r} is not.")
+            raise envs.UsageError(f"--args must be arguments of the method, which {name!r} is not.")
         choices.append([(name, value) for value in values.split(",")])
     return list(product(*choices))
 
@@ -323,10 +321,11 @@ def submit(args, cells):
     command = ["sbatch", f"--array={','.join(map(str, numbers))}", "benchmark/cell.sbatch", *selected]
     try:
         subprocess.run(command, cwd=ROOT, check=True)
-    except FileNotFoundError:
-        refuse("there is no sbatch on this machine; --slurm needs the commands of Slurm.")
+    except FileNotFoundError as error:
+        raise envs.UsageError("there is no sbatch on this machine; --slurm needs the commands of Slurm.") from error
     except subprocess.CalledProcessError as error:
-        refuse(f"sbatch refused with code {error.returncode}; the three lines to adapt stand in benchmark/cell.sbatch.")
+        reason = f"sbatch refused with code {error.returncode}"
+        raise envs.UsageError(f"{reason}; the three lines to adapt stand in benchmark/cell.sbatch.") from error
 
 
 def report(skipped, jobs, waiting, signal_number):
@@ -356,7 +355,7 @@ def run(args):
         return submit(args, cells)
     if args.cell is not None:
         if not 0 <= args.cell < len(cells):
-            refuse(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")
+            raise envs.UsageError(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")
         cells = [cells[args.cell]]
     with contextlib.redirect_stdout(Forgiving(sys.stdout)):  # no cell is left out because nobody listens
         for cell in cells:

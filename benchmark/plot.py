@@ -47,7 +47,7 @@ class Group:
     @property
     def last(self):
         """Reward per step over the last 5 % of the episodes, [num_trials]."""
-        return self.score[:, -max(1, self.score.shape[1] // 20) :].mean(1)
+        return self.score[:, envs.last_episodes(self.score.shape[1])].mean(1)
 
 
 def read(directories):

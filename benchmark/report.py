@@ -327,51 +327,49 @@ def rewrite(text, name, table):
 
 
 def published_tables(found):
-    """{page: {mark: table}} of all that docs/ and the README show; a world of your own has no place there."""
+    """{page: {mark: table}} of all that docs/ and the README show."""
     paper, beyond = results.of_the_paper(found), results.beyond_the_paper(found)
-    of_worlds = {world: table for world, table in score_tables(paper).items() if world in WORLDS}
     return {
         README: {"best": best_table(paper)},
-        DOCS / "results.md": {**of_worlds, "differences": difference_table(paper), "leaderboard": leaderboard(paper)},
+        DOCS / "results.md": {**score_tables(paper), "differences": difference_table(paper), "leaderboard": leaderboard(paper)},
         DOCS / "beyond.md": {**score_tables(beyond), "leaderboard": leaderboard(beyond)},
     }
 
 
-def publish(found, drawn):
-    """Show results in docs/ and in the README."""
+def published_texts(found):
+    """{page: its text with the tables of today}."""
     pages = published_tables(found)
     texts = {page: page.read_text(encoding="utf-8") for page in pages}
     for page, tables in pages.items():
         for mark, table in tables.items():
             texts[page] = rewrite(texts[page], mark, markdown(table))
+    return texts
+
+
+def publish(texts, drawn):
+    """Show results in docs/ and in the README."""
     for page, text in texts.items():
         page.write_text(text, encoding="utf-8")
     for name, figure in drawn.items():
         figure.savefig(DOCS / f"{name}.png", dpi=130)
 
 
-def refuse(message):
-    """End with one sentence and code 2."""
-    raise envs.UsageError(message)
-
-
 def main(args: Args):
     """Read what is finished, draw, write."""
-    if not (seeds := seeds_of(args.seeds)):
-        refuse(f"--seeds must be two numbers such as 1-20, not {args.seeds!r}.")
+    seeds = seeds_of(args.seeds)
     if args.episodes is not None:
         envs.check_whole("--episodes", args.episodes, minimum=1)
     for path in args.scripts:
         script(str(path))
     ours = seeds == (1, 20) and args.episodes is None
     if args.publish and not ours:
-        refuse("only results of seeds 1-20 and all of Table 1's episodes are published.")
+        raise envs.UsageError("only results of seeds 1-20 and all of Table 1's episodes are published.")
     fresh = results.finished(args.runs, seeds, args.episodes, tuple(map(str, args.scripts)))
-    if args.publish:
-        results.keep(fresh)
+    fresh = results.shipped(fresh) if args.publish else fresh
     found = results.in_order({**results.kept(), **fresh} if ours else fresh)
     if not found:
-        refuse(f"there is no finished cell under {args.runs}; ./benchmark.sh makes some.")
+        raise envs.UsageError(f"there is no finished cell under {args.runs}; ./benchmark.sh makes some.")
+    texts = published_texts(found) if args.publish else {}  # before anything is written, for it may be refused
     drawn = all_figures(found)
     output_dir = args.output_dir or args.runs.parent / "report"
     output_dir.mkdir(parents=True, exist_ok=True)
@@ -380,7 +378,8 @@ def main(args: Args):
     with envs.complete_file(output_dir / "report.html") as file:
         file.write(page(found, drawn).encode())
     if args.publish:
-        publish(found, drawn)
+        results.keep(fresh)
+        publish(texts, drawn)
     plt.close("all")
     tables = [f"{Path(world).stem}\n\n{markdown(table)}" for world, table in score_tables(found).items()]
     print(*tables, markdown(difference_table(found)), markdown(leaderboard(found)), sep="\n\n")

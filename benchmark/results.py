@@ -64,7 +64,7 @@ class Result:
         log.returns, log.lengths, log.outcomes = returns, lengths, outcomes
         trials, num_episodes = returns.shape
         block = block_of(num_episodes)
-        blocks, recent = num_episodes // block, slice(-max(1, num_episodes // 20), None)
+        blocks, recent = num_episodes // block, envs.last_episodes(num_episodes)
 
         def in_blocks(values):
             return values[:, : blocks * block].reshape(trials, blocks, block)
@@ -175,10 +175,16 @@ def cover(parts, first, end):
     return []
 
 
+def shipped(found):
+    """Results of the repository's own methods and worlds, without anybody's others."""
+    worlds, methods = (*WORLDS, *BEYOND_WORLDS), {**METHODS, **BEYOND}
+    return {key: result for key, result in found.items() if key[0] in worlds and key[1] in methods}
+
+
 def keep(found):
     """Write results into benchmark/results/."""
     for (world, method, optimizer), result in found.items():
-        result.save(STORE / Path(world).stem / f"{method}-{optimizer}.npz")
+        result.save(STORE / world / f"{method}-{optimizer}.npz")
 
 
 def kept():

@@ -46,7 +46,7 @@ def clean(method, num_agents, observation, num_episodes):
     steps = run.log.lengths.sum()
     memory = sum(array.nbytes for array in run.novelty.state) / TRIALS / 1000
     cells = envs.optimum("cleaner").best_return.total
-    cleaned = run.log.returns[:, -max(1, num_episodes // 20) :].mean() / cells
+    cleaned = run.log.returns[:, envs.last_episodes(num_episodes)].mean() / cells
     return [f"{seconds / steps * 1e3:.3f}", f"{sum(spent) / steps * 1e3:.4f}", f"{memory:.0f}", f"{cleaned:.0%}"]
 
 

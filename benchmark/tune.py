@@ -11,8 +11,8 @@ for SPG, whose own number that is (movebox, sign: 1.09 and 1.36 +- 0.47).
 
     python benchmark/tune.py pg decespg --jobs 2         # adds what is missing in benchmark/tuning/pg.csv and decespg.csv
 
-The tables hold what was measured and are all that the rule reads: a cell with a row there is not run again (after a change of
-a method, delete its rows), an interrupted one goes on from its checkpoint under runs/tuning/.
+The tables hold what was measured and are all that the rule reads: a cell with a row there is not run again; one without is (so
+after a change of a method delete its rows), from its checkpoint under runs/tuning/ if it was interrupted.
 """
 
 import csv
@@ -123,12 +123,11 @@ class Cell:
         command += ["--num-episodes", EPISODES[self.world], "--run-dir", run_dir]
         command += ["--optimizer", self.optimizer] if takes_optimizer(self.method) else []
         command += ["--learning-rate", self.learning_rate, *([f"--{own.replace('_', '-')}", self.value] if own else [])]
-        if not (run_dir / "episodes.npz").exists():
-            command += ["--resume"] if (run_dir / "checkpoint.pt").exists() else []
-            subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
+        command.append("--resume" if (run_dir / "checkpoint.pt").exists() else "--overwrite")  # a row that is missing is run
+        subprocess.run([str(word) for word in command], check=True, capture_output=True, text=True)
         episodes = np.load(run_dir / "episodes.npz")
         score = envs.reward_per_step(episodes["returns"], episodes["lengths"])
-        trials = score[:, -score.shape[1] // 20 :].mean(1)
+        trials = score[:, envs.last_episodes(score.shape[1])].mean(1)
         return trials.mean(), trials.min(), score.mean()
 
 

@@ -31,7 +31,7 @@ from envs.files import complete_file
 from envs.parallel import GridParallelEnv
 from envs.rollout import Rollout, distinct_rows, epsilon_greedy, in_every_step, softmax
 from envs.search import Optimum, find_optimum, optimal_plan
-from envs.statistics import EpisodeLog, reward_per_step
+from envs.statistics import EpisodeLog, last_episodes, reward_per_step
 from envs.vector import GridVectorEnv
 from envs.worlds import WORLDS, make_world, parse_options
 

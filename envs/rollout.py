@@ -132,11 +132,12 @@ def _play(
                     for j in range(obs.shape[3]):
                         distinct[net, row, j] = obs[t, k, i, j]
                     apply_network(params, net, obs[t, k, i], hidden, outputs)
+                    for a in range(len(outputs)):  # before `head`, which may turn anything into probabilities
+                        finite = finite and np.isfinite(outputs[a])
                     head(outputs, probs[i, row], parameter)
                     row_entropy[i, row] = 0.0
                     for a in range(len(outputs)):
                         p = probs[i, row, a]
-                        finite = finite and np.isfinite(p)
                         row_entropy[i, row] -= p * np.log(p) if p > 0.0 else 0.0
                 rows[t, k, i] = row
                 actions[t, k, i] = draw_action(probs[i, row], uniforms[k, t, i], greedy)

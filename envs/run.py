@@ -40,8 +40,9 @@ import envs
 from envs.command import command_line, one_line, silence
 from envs.curves import Curves
 
-# torch's optimisers ask its compiler to leave them alone, for which they import it: 2.6 of 5.6 seconds of start-up, for nothing
-# here is compiled by it. So the answer is given in advance, and Adam's step is freed of what it says to the compiler.
+# Every method of torch's optimisers is wrapped so that torch.compile leaves it alone, and the wrapper, when first called,
+# imports the compiler: 2.6 of 5.6 seconds of start-up, and nothing here is compiled by torch. So what the wrapper would find
+# out is said in advance, and Adam's step goes without it.
 for method in vars(torch.optim.Optimizer).values():
     if (plain := getattr(method, "__wrapped__", None)) is not None:
         plain.__dynamo_disable = plain
@@ -218,11 +219,7 @@ class Run:
         directory, args = self.directory, self.args
         if not directory.name:
             raise envs.UsageError(f"--run-dir must name a directory of its own, not {str(directory)!r}.")
-        kept = [directory / name for name in OUTPUT if name != "args.json"]
-        if not (args.resume or args.overwrite) and any(path.exists() for path in kept):
-            held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
-            advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
-            raise envs.UsageError(f"{directory} holds {held}; {advice}start anew with --overwrite.")
+        self._refuse_to_overwrite()
         foreign = sorted(path.name for path in directory.glob("*") if not is_ours(path.name)) if directory.is_dir() else []
         if foreign:
             raise envs.UsageError(f"{directory} holds other files ({foreign[0]}); a run needs a directory of its own.")
@@ -232,15 +229,28 @@ class Run:
             )
         directory.mkdir(parents=True, exist_ok=True)
         self._own_directory()
+        self._refuse_to_overwrite()  # what another process may have finished meanwhile
         if args.resume:
             self._load_checkpoint()
-        for old in [] if args.resume else [*kept, *directory.glob("seed*/events.*")]:
+        for old in [] if args.resume else [*self._kept(), *directory.glob("seed*/events.*")]:
             old.unlink(missing_ok=True)
         about = {"method": self.method, "args": asdict(args), "python": sys.version.split()[0]}
         about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
         about["commit"] = commit_of(script_of(args).parent)
         with envs.complete_file(directory / "args.json") as file:
             file.write(json.dumps(about, indent=2, default=str).encode())
+
+    def _kept(self):
+        """The files of a run, there or not, that nobody may lose unasked."""
+        return [self.directory / name for name in OUTPUT if name != "args.json"]
+
+    def _refuse_to_overwrite(self):
+        """UsageError if the directory holds a run that neither --resume nor --overwrite speaks of."""
+        if self.args.resume or self.args.overwrite or not any(path.exists() for path in self._kept()):
+            return
+        held = "a finished run" if self.result.exists() else "an unfinished run or a part of one"
+        advice = "go on with --resume or " if self.checkpoint.exists() and not self.result.exists() else ""
+        raise envs.UsageError(f"{self.directory} holds {held}; {advice}start anew with --overwrite.")
 
     def _own_directory(self):
         """Lock the directory for as long as this process lives; UsageError if another one works in it."""
@@ -300,7 +310,8 @@ class Run:
         handlers = {s: signal.signal(s, lambda number, _: stopped.append(number)) for s in signals}
         self.bar = tqdm(initial=first, total=last, desc=f"{self.method} {self.args.env}", unit="ep", mininterval=0.5)
         self.bar.set_postfix_str("compiling, if it is the first time")
-        self.clock = saved = time.monotonic()
+        self._set_clock()
+        saved = self.clock
         pause = self.args.checkpoint_every
         try:
             for episode in range(first, last):
@@ -342,18 +353,22 @@ class Run:
             return
         recent, seconds = slice(done - every, done), time.monotonic() - self.clock
         means = self.log.means(recent)
-        steps = means["episodic_length"] * every
+        speed = (self.log.lengths.sum(1) - self.clocked) / seconds  # [num_trials]
         points = {f"charts/{name}": values for name, values in means.items()}
         points |= {name: total / every for name, total in self.sums.items()}
-        points |= {"charts/episode": np.full(len(steps), float(done)), "charts/SPS": steps / seconds}
+        points |= {"charts/episode": np.full(len(speed), float(done)), "charts/SPS": speed}
         with writing_to(self.directory):
             self.curves.add(points, self.log.lengths.sum(1))
         self.sums.clear()
-        recently = {"reward/step": f"{means['reward_per_step'].mean():.2f}", "steps/s": f"{steps.sum() / seconds:.0f}"}
+        recently = {"reward/step": f"{means['reward_per_step'].mean():.2f}", "steps/s": f"{speed.sum():.0f}"}
         if self.world.outcome_names:
             recently["trials at best"] = f"{self.log.share_at_best(recent):.0%}"
         self.bar.set_postfix(recently, refresh=False)
-        self.clock = time.monotonic()
+        self._set_clock()
+
+    def _set_clock(self):
+        """Speed is what each trial plays from now on."""
+        self.clock, self.clocked = time.monotonic(), self.log.lengths.sum(1)
 
     def finish(self):
         """Write what was asked for and, last of all, the file that marks the run as finished; returns the team and the log."""
@@ -372,7 +387,8 @@ class Run:
             self.checkpoint.unlink(missing_ok=True)
         (directory / ".owner").unlink(missing_ok=True)
         self.lock.close()
-        say(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {self.log.summary()}")
+        ends = self.log.summary(envs.last_episodes(args.num_episodes))
+        say(f"{directory}: {args.num_trials} trial{'s' * (args.num_trials > 1)}, {ends}")
         return SimpleNamespace(**vars(self.team), log=self.log)
 
 
@@ -427,6 +443,8 @@ def play_teams(args, world, team, num_episodes, video):
     log, frames = envs.EpisodeLog(world, teams, num_episodes), []
     for episode in range(num_episodes):
         play_episode(rollout, policy, generators)
+        if not rollout.finite:
+            raise envs.UsageError("the policies' numbers are not finite, so they say nothing of what to do.")
         log.add(episode, rollout.reward[:, :, 0], rollout.lengths, rollout.outcomes)
         if episode == 0:
             rewards = ["start", *(f"step {t + 1}   reward {rollout.reward[t, 0, 0]:+g}" for t in range(rollout.lengths[0]))]
@@ -470,16 +488,17 @@ def evaluate(given, script):
     for field in fields(given):
         if getattr(given, field.name) != field.default and field.name not in heeded:
             raise envs.UsageError(f"{option(field.name)} does not go with --evaluate, which takes what policy.pt says.")
-    num_episodes, video = given.num_episodes, given.evaluate.with_suffix(".gif")
+    num_episodes = given.num_episodes
     check_limits(given, ("seed", *(["num_episodes"] if num_episodes is not None else [])))
     num_episodes = 100 if num_episodes is None else num_episodes
     args, world, team = load(given.evaluate, script)
+    video = given.evaluate.with_suffix(".gif")
     if video == given.evaluate or (video.exists() and not given.overwrite):
         raise envs.UsageError(f"{video} is there already; --overwrite replaces the film, not the policies.")
     args.seed, args.greedy = given.seed, given.greedy
     log = play_teams(args, world, team, num_episodes, video)
     played = f"{num_episodes} episode{'s' * (num_episodes > 1)} of {args.num_trials} team{'s' * (args.num_trials > 1)}"
-    say(f"{given.evaluate}: {played}, {log.summary(share=1.0)}; one of them in {video}")
+    say(f"{given.evaluate}: {played}, {log.summary(slice(None))}; one of them in {video}")
 
 
 def option(name):

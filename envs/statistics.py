@@ -1,5 +1,7 @@
 """What is said about episodes: the metric of the paper, the curves, and how the trials ended."""
 
+import math
+
 import numpy as np
 
 from envs.base import World, check_memory, check_whole
@@ -8,6 +10,11 @@ from envs.base import World, check_memory, check_whole
 def reward_per_step(returns, lengths):
     """The paper's "average reward per step" as its authors compute it: return / index of the last step (T - 1, at least 1)."""
     return np.asarray(returns) / np.maximum(np.asarray(lengths) - 1, 1)
+
+
+def last_episodes(num_episodes: int) -> slice:
+    """The last 5 % of the episodes, rounded up: those whose mean is a trial's score."""
+    return slice(-math.ceil(num_episodes / 20), None)
 
 
 class EpisodeLog:
@@ -48,12 +55,11 @@ class EpisodeLog:
             return float("nan")
         return float(np.mean(self.usual_outcomes(episodes) == self.world.best_outcome))
 
-    def summary(self, share: float = 0.05) -> str:
-        """One line on the last share of the episodes: in how many trials they usually ended where, and the reward per step."""
-        recent = slice(-max(1, int(share * self.returns.shape[1])), None)
-        usual = self.usual_outcomes(recent)
+    def summary(self, episodes: slice) -> str:
+        """One line on some episodes: in how many trials they usually ended where, and the reward per step."""
+        usual = self.usual_outcomes(episodes)
         names = ("time limit", *self.world.outcome_names)
         ends = ", ".join(f"{np.sum(usual == k)} {name}" for k, name in enumerate(names) if np.any(usual == k))
-        score = self.means(recent)["reward_per_step"]
+        score = self.means(episodes)["reward_per_step"]
         spread = f" (worst trial {score.min():.2f}, best {score.max():.2f})" if len(score) > 1 else ""
         return f"usual end: {ends}; reward per step {score.mean():.2f}{spread}"

@@ -9,6 +9,7 @@ import pytest
 
 from benchmark import claims, results
 from benchmark.report import DOCS, README
+from tests.helpers import assert_refused
 from tests.test_results import some_result
 
 
@@ -119,3 +120,8 @@ def test_worse_with_training_is_a_matter_of_standard_errors():
     assert re.match(r"PG 0.110 in the first 100 episodes, 0.0\d\d in the end; COMA 0.110 ", words)
     found["cleaner", "coma", "sign"] = some_result(0.2 + noise, score=np.full((20, 3), 0.11))
     assert claims.worse_with_training(claims.Cells(found, "cleaner", "sign"))[1] == "partly"
+
+
+def test_a_result_that_is_missing_is_named(kept, monkeypatch):
+    monkeypatch.setattr(claims.results, "kept", lambda: {key: kept[key] for key in kept if key != ("pushbox", "coma", "sign")})
+    assert_refused("the README's sentences need pushbox/coma/sign", claims.main)

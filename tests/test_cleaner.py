@@ -155,7 +155,7 @@ def test_no_outcome_is_best():
     log = envs.EpisodeLog(WORLD, num_trials=2, num_episodes=3)
     log.add(0, np.full((200, 2), 0.25), [200, 200], [0, 0])
     assert np.isnan(log.share_at_best(slice(None)))
-    assert "usual end: 2 time limit;" in log.summary()
+    assert "usual end: 2 time limit;" in log.summary(slice(None))
 
 
 def test_positions_show_all_agents_to_all():

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 
 from benchmark import compare, figures, report, results
 from benchmark.cells import ROOT, Cell, seconds_of, select
-from tests.helpers import assert_one_sentence, script
+from tests.helpers import assert_one_sentence, assert_refused, script
 
 BLOCK = dict(first_seed=5, num_trials=2, num_episodes=6000)
 
@@ -197,6 +198,23 @@ def test_a_script_and_a_world_of_ones_own_need_no_list(tmp_path, monkeypatch, ca
     assert report.score_tables(found)[str(world)][1][0] == "mine"
     drawn = figures.learning_curves(found, results.named_in(found)[1])
     assert [axis.get_title() for axis in drawn.axes] == ["race, sign", "race, adam"]
+
+
+def test_a_script_of_ones_own_needs_a_name_of_its_own(tmp_path):
+    shutil.copy(ROOT / "algos" / "pg.py", tmp_path / "pg.py")
+    assert_refused("needs another name than algos/pg.py", lambda: Cell(str(tmp_path / "pg.py"), "climbing", "adam").settings)
+
+
+def test_a_stop_while_a_cell_starts_reaches_its_script(cell, monkeypatch):
+    job, told = compare.Job(cell, 60.0), []
+
+    def start(*_, **__):
+        job.stop()  # a signal comes before the runner holds the process
+        return SimpleNamespace(wait=lambda: -15, send_signal=told.append, poll=lambda: None)
+
+    monkeypatch.setattr(compare.subprocess, "Popen", start)
+    job.run()
+    assert (told, job.code, job.trouble) == ([signal.SIGTERM], -15, "")
 
 
 def test_a_selection_is_a_numbered_list():

@@ -48,13 +48,19 @@ def test_tables_are_published_and_one_without_a_place_is_refused_before_anything
     for page in pages:
         text = page.read_text(encoding="utf-8").replace("| PG |", "| old |").replace("| sign |", "| old |")
         (tmp_path / page.name).write_text(text, encoding="utf-8")
-    report.publish(kept, {})
+    report.publish(report.published_texts(kept), {})
     assert [(tmp_path / page.name).read_bytes() for page in pages] == [page.read_bytes() for page in pages]
     (tmp_path / "beyond.md").write_text("<!-- leaderboard -->\nno end", encoding="utf-8")
     before = [path.read_bytes() for path in sorted(tmp_path.iterdir())]
     with pytest.raises(envs.UsageError, match="must be marked by one <!-- leaderboard --> and one <!-- end leaderboard -->"):
-        report.publish({key: kept[key] for key in [("pushbox", "pg", "sign")]}, {"figure4": None})
+        report.published_texts({key: kept[key] for key in [("pushbox", "pg", "sign")]})
     assert [path.read_bytes() for path in sorted(tmp_path.iterdir())] == before
+
+
+def test_what_is_published_is_of_the_repositorys_methods_and_worlds(kept):
+    pg = kept["pushbox", "pg", "sign"]
+    own = {("/my/world.py", "qmix", "adam"): pg, ("pushbox", "my_method", "sign"): pg, ("/my/pushbox.py", "pg", "sign"): pg}
+    assert results.shipped({**kept, **own}) == kept
 
 
 def ended(kept, usual, met, num_episodes=20_000):

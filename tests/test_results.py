@@ -47,7 +47,7 @@ def test_a_result_is_the_block_means_of_its_episodes(tmp_path):
     assert result.score.shape == result.at_best.shape == (20, 20)  # blocks of 12
     assert result.score[3, 1] == pytest.approx(score[3, 12:24].mean(), abs=1e-6)
     assert result.at_best[4, 0] == pytest.approx((outcomes[4, :12] == best).mean(), abs=1e-6)
-    assert result.last == pytest.approx(score[:, -12:].mean(1))
+    assert result.last == pytest.approx(score[:, -13:].mean(1))
     assert result.usual[5] == np.bincount(outcomes[5, -12:]).argmax()
     assert (result.num_episodes, result.seconds) == (250, 12.5)
     assert result.about["args"]["learning_rate"] == Cell("pg", "pushbox", "adam").settings["learning_rate"]

@@ -289,14 +289,15 @@ def test_the_next_episode_overwrites_the_arrays(played):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_numbers_that_are_not_finite_are_noticed(value):
+@pytest.mark.parametrize(("head", "parameter"), [(envs.softmax, 1.0), (envs.epsilon_greedy, 0.05)])
+def test_numbers_that_are_not_finite_are_noticed(value, head, parameter):
     world = world_of("pushbox")
-    policy, rollout = networks(world), envs.Rollout(world, TRIALS)
-    rollout.play(policy.params, generators(1, 2, 3))
+    policy, rollout = networks(world), envs.Rollout(world, TRIALS, head=head)
+    rollout.play(policy.params, generators(1, 2, 3), parameter)
     assert rollout.finite
     policy.params[1].data[2, 0, 0] = value  # a bias in the first layer of one network
     policy.params[2].data[2] = 1.0
-    rollout.play(policy.params, generators(1, 2, 3))
+    rollout.play(policy.params, generators(1, 2, 3), parameter)
     assert not rollout.finite
 
 

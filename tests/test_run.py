@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import itertools
 import json
 import os
 import random
@@ -14,6 +15,7 @@ import threading
 import time
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -322,6 +324,35 @@ def assert_same_curves(directory, other):
         assert [step for step, _ in found["charts/SPS"]] == [step for step, _ in expected["charts/SPS"]]
 
 
+def test_the_first_speed_after_resuming_is_of_what_was_played_since(tmp_path, monkeypatch):
+    """Episodes of 4 steps, and a clock that goes on by a second or more in each: nobody plays more than 4 steps a second."""
+    ticks = itertools.count()
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+    words = ["--env", "gotogether", "--max-steps", 4, "--num-episodes", 60, "--log-every", 10, "--run-dir", tmp_path / "run"]
+    with monkeypatch.context() as patch:
+        stop_after(patch, 43, signal.SIGINT)
+        assert command("pg", *words).code == 130
+    time.sleep(1)  # as in `resume`
+    assert command("pg", *words, "--resume").code == 0
+    speeds = [speed for _, speed in curves(tmp_path / "run" / "seed1")["charts/SPS"]]
+    assert len(speeds) == 6
+    assert 2 < min(speeds) <= max(speeds) <= 4
+
+
+def test_a_run_that_another_process_has_finished_meanwhile_is_not_lost(tmp_path, monkeypatch):
+    """Between the question whether something is there and the lock."""
+    own = run.Run._own_directory
+
+    def late(self):
+        self.result.write_text("finished")
+        own(self)
+
+    monkeypatch.setattr(run.Run, "_own_directory", late)
+    ended = command("pg", "--env", "findtreasure", "--num-episodes", 2, "--run-dir", tmp_path / "run")
+    assert_refusal("pg", ended, "holds a finished run")
+    assert (tmp_path / "run" / "episodes.npz").read_text() == "finished"
+
+
 def test_ctrl_c_leaves_a_checkpoint_from_which_the_run_goes_on(interrupted, tmp_path):
     stopped, ended, whole = interrupted
     assert ended.code == 130
@@ -612,6 +643,7 @@ BAD_INPUT = {
     "--evaluate missing.pt": "missing.pt",
     "--evaluate other.pt": "other.pt is not a policy.pt",
     "--evaluate folder": "folder is not a policy.pt",
+    "--evaluate /": "/ is not a policy.pt",
 }
 
 

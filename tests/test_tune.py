@@ -2,6 +2,7 @@
 
 import zipfile
 
+import numpy as np
 import pytest
 
 from benchmark import tune
@@ -62,6 +63,19 @@ def test_what_is_in_the_table_is_not_run_again(table, monkeypatch, capsys):
     fill(table, "pushbox", "sign", [(n, n) for n in range(9)])
     tune.main(("decespg",), worlds=("pushbox",), optimizers=("sign",))
     assert "pushbox sign ('0.001', '10') 8.0 7.0 8.0" in capsys.readouterr().out
+
+
+def test_what_is_not_in_the_table_is_run_though_an_old_result_lies_there(table, monkeypatch):
+    told = []
+    monkeypatch.setattr(tune.subprocess, "run", lambda command, **_: told.append(command))
+    cell = table.cells("pushbox", "sign")[0]
+    folder = tune.ROOT / "runs" / "tuning" / "decespg" / "pushbox-sign-0.0001-1"
+    folder.mkdir(parents=True)
+    np.savez(folder / "episodes.npz", returns=np.ones((5, 100)), lengths=np.full((5, 100), 2))
+    assert cell.run() == (1, 1, 1)
+    (folder / "checkpoint.pt").touch()
+    cell.run()
+    assert [command[-1] for command in told] == ["--overwrite", "--resume"]
 
 
 def test_a_failed_run_is_shown_and_leaves_no_row(table, monkeypatch, capsys):
