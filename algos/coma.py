@@ -54,7 +54,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
     ("gotogether", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-3),
-    ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("pushbox", "sign"): dict(learning_rate=3e-4, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("climbing", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
