@@ -52,24 +52,24 @@ WORLDS = {
 }
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/edti.csv); guesses where it has no row yet.
 TUNED = {
-    ("cleaner", "sign"): dict(learning_rate=1e-4, eta=10.0),
-    ("cleaner", "adam"): dict(learning_rate=1e-3, eta=10.0),
-    ("findtreasure", "sign"): dict(learning_rate=1e-3, eta=30.0),
-    ("findtreasure", "adam"): dict(learning_rate=3e-3, eta=10.0),
-    ("gotogether", "sign"): dict(learning_rate=1e-3, eta=3.0),
-    ("gotogether", "adam"): dict(learning_rate=3e-3, eta=10.0),
-    ("movebox", "sign"): dict(learning_rate=1e-4, eta=30.0),
-    ("movebox", "adam"): dict(learning_rate=1e-3, eta=10.0),
-    ("pushbox", "sign"): dict(learning_rate=1e-3, eta=30.0),
-    ("pushbox", "adam"): dict(learning_rate=3e-3, eta=10.0),
-    ("climbing", "sign"): dict(learning_rate=1e-3, eta=3.0),
-    ("climbing", "adam"): dict(learning_rate=3e-3, eta=3.0),
-    ("passage", "sign"): dict(learning_rate=1e-3, eta=30.0),
-    ("passage", "adam"): dict(learning_rate=3e-3, eta=3.0),
-    ("secretroom", "sign"): dict(learning_rate=1e-3, eta=10.0),
-    ("secretroom", "adam"): dict(learning_rate=3e-3, eta=30.0),
+    ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=10.0),
+    ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
+    ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=30.0),
+    ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
+    ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("climbing", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
+    ("climbing", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=3.0),
+    ("passage", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
+    ("passage", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=3.0),
+    ("secretroom", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("secretroom", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=30.0),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, eta=10.0)  # what a world of your own gets
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critics learn from rewards divided by this, so from 0.3 to 10; their curves are in units of reward
 
 
@@ -83,8 +83,8 @@ class Args(RunArgs):
     """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
-    critic_learning_rate: Annotated[float, AtLeast(0)] = 3e-3
-    """step size of critics, which always have a persistent Adam (chosen here; ac.py's is tuned)"""
+    critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
+    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
     gae_lambda: Annotated[float, Between(0, 1)] = 0.95
     """lambda of the advantages: 0 looks one step ahead, 1 to the end of the episode (Schulman et al., 2016)"""
     eta: Annotated[float | None, AtLeast(0)] = None
