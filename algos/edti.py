@@ -62,12 +62,12 @@ TUNED = {
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("climbing", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
-    ("climbing", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=3.0),
-    ("passage", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
-    ("passage", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=3.0),
-    ("secretroom", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("secretroom", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=30.0),
+    ("climbing", "sign"): dict(learning_rate=1e-3, eta=3.0),
+    ("climbing", "adam"): dict(learning_rate=3e-3, eta=3.0),
+    ("passage", "sign"): dict(learning_rate=1e-3, eta=30.0),
+    ("passage", "adam"): dict(learning_rate=3e-3, eta=3.0),
+    ("secretroom", "sign"): dict(learning_rate=1e-3, eta=10.0),
+    ("secretroom", "adam"): dict(learning_rate=3e-3, eta=30.0),
 }
 OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critics learn from rewards divided by this, so from 0.3 to 10; their curves are in units of reward
