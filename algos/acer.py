@@ -6,8 +6,8 @@ once more from an old one. With mu, the policy that played it, rho = pi / mu and
     Qret_t = r_t + gamma (V_{t+1} + min(1, rho_{t+1}) (Qret_{t+1} - Q_{t+1}))         is what Q(o_t, a_t) goes towards, and
     g_t(a) = [a = a_t] min(c, rho_t) (Qret_t - V_t) / pi(a) + max(0, 1 - c / rho_t(a)) (Q(o_t, a) - V_t)
 
-is where pi(. | o_t) goes, though no faster away from a running average of the policy than the trust region allows: so far as
-the step follows the gradient's length. Sign descent does not, so the trust region turns a step there and does not bound it.
+is where pi(. | o_t) goes, though no faster away from a running average of the policy than the trust region allows. Under sign
+descent, whose steps do not follow the gradient's length, the trust region turns a step and does not bound it.
 
 Wang et al., "Sample Efficient Actor-Critic with Experience Replay" (ICLR 2017): Eqs. 5 and 9-12, and Section 4 for c, delta,
 alpha, the weight of the entropy and one replay an episode. The traces are cut at 1, as in its published implementations. A

@@ -18,7 +18,7 @@ for continuous actions rewards diversity instead). What has to be chosen here:
   covariance is singular and no marginal can be had. So minibatches of 64 are drawn from the last 4000 steps, the first when 64
   have been seen: one after each of the first 1000 episodes and one after every fifth of the others. A step of play is used
   about twice in findtreasure and pushbox and less where episodes are long, 0.2, 0.08 and 0.02 times in movebox, cleaner and
-  gotogether. Minibatches by the step, so that each is used three times, do not help there (see the method's page).
+  gotogether. Minibatches by the step, so that each is used three times, changed little (see the method's page).
 - These are fewer steps of Adam, so they are 0.003 long (there 0.001): under random play in findtreasure ||e||^2 comes to rest
   after 250 of them instead of 700, at the same value.
 - w_S leaves S about 1 % of what phi and psi cannot say, so steps into a wall or a teammate go on to earn a bonus.

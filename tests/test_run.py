@@ -261,6 +261,14 @@ def test_evaluate_refuses_what_it_does_not_heed(policy_file, words, said):
     assert contents(Path(policy_file).parent) == before
 
 
+def test_a_team_whose_numbers_are_not_finite_is_not_evaluated(policy_file, tmp_path):
+    saved = torch.load(policy_file, weights_only=True)
+    saved["parts"]["policy"][-1][:] = np.nan  # the last biases
+    torch.save(saved, tmp_path / "policy.pt")
+    assert_refusal("pg", command("pg", "--evaluate", tmp_path / "policy.pt"), "numbers are not finite")
+    assert not (tmp_path / "policy.gif").exists()
+
+
 def test_evaluate_overwrites_nothing_unasked(policy_file):
     film = Path(policy_file).with_suffix(".gif")
     film.write_text("mine")
