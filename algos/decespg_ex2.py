@@ -54,7 +54,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, slots=10),
     ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.03, slots=10),
     ("movebox", "sign"): dict(learning_rate=3e-4, beta=0.03, slots=3),
-    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.03, slots=3),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=3e-3, slots=3),
     ("pushbox", "sign"): dict(learning_rate=3e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=3e-4, beta=1.0, slots=10),
 }
