@@ -62,7 +62,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.1, slots=10),
     ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.01, slots=10),
     ("movebox", "sign"): dict(learning_rate=3e-4, beta=0.3, slots=3),
-    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.1, slots=3),
+    ("movebox", "adam"): dict(learning_rate=3e-4, beta=0.3, slots=3),
     ("pushbox", "sign"): dict(learning_rate=1e-4, beta=1.0, slots=10),
     ("pushbox", "adam"): dict(learning_rate=1e-3, beta=3.0, slots=10),
 }
