@@ -146,7 +146,7 @@ def train(args: Args):
 
         # Actors: climb along 1/T sum_t delta_t grad log pi(a_t | o_t).
         weights = torch.from_numpy(delta / rollout.lengths)[:, :, None]  # the same for all agents
-        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
+        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)  # of each distinct observation, once
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]
         update(optimizer, args.optimizer, loss.sum())
 

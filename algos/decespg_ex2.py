@@ -88,7 +88,7 @@ class Args(RunArgs):
     min_replay: Annotated[int, AtLeast(1)] = 1000
     """earlier steps without which the discriminators are not fitted and give no bonus (as in the published atari.py)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned for spg.py only; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py, in others 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

@@ -316,7 +316,7 @@ def train(args: Args):
         advantage = advantages.reshape(-1, trials, 3, agents)[:, :, 0]  # [T, num_trials, num_agents]
         error = delta.reshape(-1, trials, 3, agents)[:, :, 0]
         weights = torch.from_numpy(advantage / lengths[:, None])
-        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
+        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)  # of each distinct observation, once
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]
         update(optimizer, args.optimizer, loss.sum())
 

@@ -257,7 +257,7 @@ def train(args: Args):
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.
         returns = discounted_returns(augmented, rollout.lengths, args.gamma)
         weights = torch.from_numpy(returns / rollout.lengths[:, None])  # [T, num_trials, num_agents]
-        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
+        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)  # of each distinct observation, once
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]
         update(optimizer, args.optimizer, loss.sum())
 

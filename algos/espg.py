@@ -74,7 +74,7 @@ class Args(RunArgs):
     noise: Annotated[float, AtLeast(1e-6)] = 0.01
     """variance of the noise (sigma_epsilon^2 of Eq. 7); n visits to an isolated pair give eta = n / (n + noise)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned for spg.py only; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py, in others 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

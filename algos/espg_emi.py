@@ -94,7 +94,7 @@ class Args(RunArgs):
     gaussian_weight: Annotated[float, AtLeast(0)] = 0.5
     """w_KL of the divergence of psi(a) from the unit Gaussian (the published code's)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned for spg.py only; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py, in others 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

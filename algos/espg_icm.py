@@ -79,7 +79,7 @@ class Args(RunArgs):
     icm_hidden: Annotated[tuple[int, ...], AtLeast(1)] = (64,)
     """widths of the hidden layers of the inverse and the forward model (those of phi: --hidden)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned for spg.py only; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py, in others 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

@@ -36,7 +36,7 @@ WORLDS = {
     "passage": dict(hidden=(64,), gamma=0.99, max_steps=200, num_episodes=10_000),
     "secretroom": dict(hidden=(64,), gamma=0.99, max_steps=200, num_episodes=10_000),
 }
-# The tuning rule's choice for each world and optimiser (benchmark/tuning/pg.csv); guesses where it has no row yet.
+# The tuning rule's choice for each world and optimiser (benchmark/tuning/pg.csv), or that of a world of the same size.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-3),
     ("cleaner", "adam"): dict(learning_rate=3e-4),
@@ -138,7 +138,7 @@ def train(args: Args):
         # Climb along 1/T sum_t G_t grad log pi(a_t | o_t), Eq. 14.
         returns = discounted_returns(rollout.reward, rollout.lengths, args.gamma)
         weights = torch.from_numpy(returns / rollout.lengths[:, None])  # [T, num_trials, num_agents]
-        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)
+        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)  # of each distinct observation, once
         loss = -(weights * rollout.of_taken(log_probs)).sum((0, 2))  # [num_trials]
         update(optimizer, args.optimizer, loss.sum())
 

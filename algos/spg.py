@@ -66,7 +66,7 @@ class Args(RunArgs):
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     slots: Annotated[int | None, AtLeast(0)] = None
-    """episodes kept for each terminal state, 0: none (None: tuned for spg.py only; 3 in cleaner and movebox, else 10)"""
+    """episodes kept for each terminal state, 0: none (None: tuned in spg.py, in others 3 in cleaner and movebox, else 10)"""
 
 
 class StackedMLP:

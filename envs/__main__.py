@@ -8,6 +8,7 @@ After every step it prints the map, what each agent observes and what the team e
 
 import time
 from dataclasses import dataclass
+from string import ascii_lowercase, digits
 
 import numpy as np
 import tyro
@@ -35,7 +36,7 @@ def play(args: Args):
     env = envs.make(args.world, render_mode="ansi", **envs.parse_options(args.options))
     rng = np.random.default_rng(envs.check_whole("--seed", args.seed, minimum=0))
     delay = envs.check_number("--delay", args.delay, lowest=0, highest=3600)
-    letters = {name.split()[-1][0]: action for action, name in enumerate(env.world.action_names)}
+    letters = letters_of(env.world.action_names) if args.keys else {}
     obs, _ = env.reset()
     print(describe(env, obs))
     total, steps = 0.0, 0
@@ -50,6 +51,7 @@ def play(args: Args):
             actions = rng.integers(env.world.num_actions, size=env.num_agents)
         obs, rewards, _, _, infos = env.step(dict(zip(env.agents, actions, strict=True)))
         reward, outcome = rewards["agent_0"], infos["agent_0"]["outcome"]
+        env.world.check_outcomes(outcome)
         total, steps = total + reward, steps + 1
         done = ", ".join(f"agent {i} {env.world.action_names[action]}" for i, action in enumerate(actions))
         print(f"\nstep {steps}: {done}; the team earned {reward:g} ({total:g} so far)\n{describe(env, obs)}")
@@ -62,13 +64,25 @@ def describe(env, obs):
     """The map, and a line for each agent on what it observes: the numbers, and in brackets what they mean."""
     lines = [env.render()]
     for i, numbers in enumerate(obs.values()):
+        meaning = ""
         if env.world.sights:
             meaning = " and ".join(sight for sight, seen in zip(env.world.sights, numbers, strict=True) if seen)
-        else:
+        elif isinstance(env.world, envs.PositionWorld):
             places = np.rint(numbers / env.world.cell).astype(int).reshape(-1, 2)
             meaning = " ".join(f"({row}, {column})" for row, column in places)
-        lines.append(f"agent {i} observes {' '.join(f'{number:.3g}' for number in numbers)}  [{meaning}]")
+        lines.append(f"agent {i} observes {' '.join(f'{number:.3g}' for number in numbers)}{meaning and f'  [{meaning}]'}")
     return "\n".join(lines)
+
+
+def letters_of(names):
+    """A letter for every action, {letter: action}, if possible of its last word; UsageError if there are too many actions."""
+    letters, others = {}, ascii_lowercase + digits
+    if len(names) > len(others):
+        raise envs.UsageError(f"--keys has letters for at most {len(others)} actions, and this world has {len(names)}.")
+    for action, name in enumerate(names):
+        wanted = [letter for letter in name.split()[-1].lower() if letter in others]
+        letters[next(letter for letter in (*wanted, *others) if letter not in letters)] = action
+    return letters
 
 
 def ask(env, letters):

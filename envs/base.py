@@ -15,8 +15,9 @@ from functools import cache, cached_property
 import numba
 import numpy as np
 from numba import float32, float64, int64, njit, typeof
+from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
-from numba.core.types import BaseTuple, CompileResultWAP
+from numba.core.types import BaseTuple, Boolean, CompileResultWAP, Float, Integer
 
 
 def find_cache():
@@ -53,6 +54,8 @@ def reason_of(error):
     """What numba says is wrong with a function, in one line: what it cannot do, and where."""
     lines = [line.strip() for line in re.sub(r"\x1b\[[0-9;]*m", "", str(error)).splitlines()]
     what = next((line for line in lines if line and not line.startswith("Failed in")), type(error).__name__)
+    if "NRT" in what or "Resolution failure" in what:
+        what = "they may only read and write the arrays that they are given, not make arrays or use Python's lists"
     where = next((line.rstrip(":") for line in lines if line.startswith("File ")), "")
     return f"{what.rstrip('.:')}{f' ({where})' if where else ''}"
 
@@ -98,10 +101,16 @@ class World:
             raise UsageError(f"{self.name} must have at most {MOST_NAMES} actions and as many outcomes.")
         if not 0 <= self.best_outcome <= len(self.outcome_names):
             raise UsageError(f"{self.name}'s best_outcome must be one of its {len(self.outcome_names)} outcomes, or 0.")
-        self.rules, self.start = rules, np.array(start, np.int64)
-        self.local_index = np.array(local_index, np.int64)
-        self.num_agents, self.obs_dim, self.cell = num_agents, obs_dim, float(cell)
-        self.state_scale = np.array(state_scale, np.float32)
+        if not all(isinstance(function, Dispatcher) for function in (self.step, self.observe)):
+            raise UsageError(f"{self.name}'s step and observe must be functions compiled by envs.rule, in a staticmethod.")
+        self.rules, self.cell = rules, float(cell)
+        self.num_agents = check_whole(f"{self.name}'s num_agents", num_agents, minimum=1)
+        self.obs_dim = check_whole(f"{self.name}'s obs_dim", obs_dim, minimum=1)
+        self.start = check_array(f"{self.name}'s start", start, np.int64, shape=(None,))
+        self.state_scale = check_array(f"{self.name}'s state_scale", state_scale, np.float32, shape=self.start.shape)
+        self.local_index = check_array(f"{self.name}'s local_index", local_index, np.int64, shape=(self.num_agents, None))
+        if not ((self.local_index >= 0) & (self.local_index < len(self.start))).all():
+            raise UsageError(f"{self.name}'s local_index must name entries of the state, 0 to {len(self.start) - 1}.")
 
     @property
     def num_actions(self) -> int:
@@ -110,19 +119,30 @@ class World:
     @cached_property
     def compiled(self):
         """`step` and `observe` as compiled loops take them, see `by_address`."""
-        for function in (self.step, self.observe):
-            if not hasattr(function, "compile"):
-                raise UsageError(f"{self.name}'s step and observe must be functions compiled by envs.rule.")
-        rules, state = typeof(self.rules), int64[::1]
+        state = int64[::1]
         try:
+            rules = typeof(self.rules)
             step = by_address(self.step, rules, state, state)
             observe = by_address(self.observe, rules, float64, state, float32[:, ::1])
-        except NumbaError as error:
+        except (NumbaError, TypeError, ValueError) as error:
             raise UsageError(f"{self.name}'s rules cannot be compiled: {reason_of(error)}.") from error
         returned = self.step.overloads[rules, state, state].signature.return_type
-        if not (isinstance(returned, BaseTuple) and len(returned) == 2):
-            raise UsageError(f"{self.name}'s step must return a reward and an outcome, not {returned}.")
+        kinds = ((Float, Integer, Boolean), (Integer, Boolean))  # of a reward and an outcome
+        if not (isinstance(returned, BaseTuple) and len(returned) == 2 and all(map(isinstance, returned, kinds))):
+            raise UsageError(f"{self.name}'s step must return a reward and a whole number as outcome, not {returned}.")
         return step, observe
+
+    @property
+    def drawable(self):
+        """Whether the world says what it looks like."""
+        return type(self).sketch is not World.sketch
+
+    def check_outcomes(self, outcomes):
+        """UsageError if one of these, [..], is none of the world's outcomes."""
+        lowest, highest, named = np.min(outcomes), np.max(outcomes), len(self.outcome_names)
+        if lowest < 0 or highest > named:
+            what = f"an outcome from 0 to {named}, the number of its outcome_names"
+            raise UsageError(f"{self.name}'s step must return {what}, not {lowest if lowest < 0 else highest}.")
 
     def plan(self):
         """Joint actions [max_steps, num_agents] of a good team, in a world that is not searchable and never ends early."""
@@ -175,6 +195,18 @@ def check_choice(option, value, choices):
     if type(value) is not type(choices[0]) or value not in choices:
         raise UsageError(f"{option} must be one of {', '.join(map(repr, choices))}, not {value!r}.")
     return value
+
+
+def check_array(what, value, dtype, shape):
+    """`value` as an array of this type and shape, in which None is any length; UsageError otherwise."""
+    try:
+        array = np.array(value, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"{what} must be numbers, not {value!r}.") from error
+    if array.ndim != len(shape) or not all(n in (None, has) for n, has in zip(shape, array.shape, strict=True)):
+        wanted, found = (", ".join("any" if n is None else str(n) for n in lengths) for lengths in (shape, array.shape))
+        raise UsageError(f"{what} must be numbers [{wanted}], and they are [{found}].")
+    return array
 
 
 def check_seed(seed):

@@ -11,7 +11,7 @@ rollout keeps these distinct observations and, for each step, which of them it w
 import numpy as np
 from numba import float64, typeof
 
-from envs.base import World, by_address, check_memory, check_whole, kernel
+from envs.base import UsageError, World, by_address, check_memory, check_whole, kernel
 from envs.vector import GridVectorEnv
 
 
@@ -265,7 +265,8 @@ class Rollout:
         """Play with any policy: policy(obs) says the probabilities of all actions, [num_trials, num_agents, num_actions].
 
         It is asked once for each time step and gets obs float32 [num_trials, num_agents, obs_dim] of all trials, ended ones
-        too, so what it carries along from step to step belongs to a trial by its index. Draws as `play` does.
+        too, so what it carries along from step to step belongs to a trial by its index. Draws as `play` does. UsageError for
+        what are no probabilities.
         """
         world, env = self.world, GridVectorEnv(self.world, len(self.lengths))
         for generator, row in zip(generators, self._uniforms, strict=True):
@@ -275,6 +276,7 @@ class Rollout:
         self.lengths[:], self.entropy[:], self._states[0] = 0, 0.0, world.start
         for t in range(world.max_steps):
             probs = np.asarray(policy(self._all_obs[t].copy())).astype(np.float64)
+            self._check_probabilities(probs)
             self.finite = self.finite and bool(np.isfinite(probs).all())
             self._actions[t] = 0
             for k, i in np.ndindex(probs.shape[:2]):
@@ -294,6 +296,14 @@ class Rollout:
         obs, rows = distinct_rows(self._all_obs[:-1], self.lengths)
         self._rows[: len(rows)] = rows
         self._show(obs)
+
+    def _check_probabilities(self, probs):
+        """UsageError for something else than what the actions of every trial and agent may be drawn from."""
+        shape = (len(self.lengths), self.world.num_agents, self.world.num_actions)
+        if probs.shape != shape:
+            raise UsageError(f"a policy must say probabilities of all actions, {list(shape)}, not {list(probs.shape)} numbers.")
+        if np.isfinite(probs).all() and not (probs.min() >= 0 and np.abs(probs.sum(2) - 1).max() < 1e-3):
+            raise UsageError("a policy must say probabilities, at least 0 and adding up to 1 over the actions, not logits.")
 
     def _show(self, obs):
         longest = self.lengths.max()

@@ -174,6 +174,17 @@ def generators_of(args):
     return [[np.random.default_rng(seed) for seed in stream] for stream in zip(*seeds, strict=True)]
 
 
+def check_parts(team):
+    """UsageError for a part of a team that could not be saved."""
+    for name, part in vars(team).items():
+        arrays = getattr(part, "params", getattr(part, "state", None))
+        if not isinstance(arrays, list | tuple) or not all(isinstance(array, np.ndarray | torch.Tensor) for array in arrays):
+            raise envs.UsageError(
+                f"the team's {name}, a {type(part).__name__}, must list its arrays and tensors as `params` or `state`, which is"
+                " what a checkpoint keeps."
+            )
+
+
 def arrays_of(part):
     """The arrays and tensors that a part of a team consists of: a network's `params`, the `state` of everything else."""
     arrays = part.params if hasattr(part, "params") else part.state
@@ -208,6 +219,9 @@ class Run:
         self.directory = args.run_dir
         self.checkpoint, self.result = self.directory / "checkpoint.pt", self.directory / "episodes.npz"
         self.start = 0
+        check_parts(team)  # what cannot be saved or drawn is said now, not after hours
+        if args.capture_video:
+            envs.draw(world, world.start)
         with writing_to(self.directory):
             self._open_directory()
             trials = [self.directory / f"seed{args.seed + k}" for k in range(args.num_trials)]
@@ -237,6 +251,7 @@ class Run:
         about = {"method": self.method, "args": asdict(args), "python": sys.version.split()[0]}
         about.update({package: version(package) for package in ("torch", "numpy", "numba", "gymnasium")})
         about["commit"] = commit_of(script_of(args).parent)
+        about["source"] = source_of(script_of(args), self.world)
         with envs.complete_file(directory / "args.json") as file:
             file.write(json.dumps(about, indent=2, default=str).encode())
 
@@ -338,9 +353,12 @@ class Run:
         policy_loss and the method's own figures are [num_trials]. UsageError if the policies' numbers are no longer finite.
         """
         if not rollout.finite:
+            kept = ", and the last checkpoint is kept" * self.checkpoint.exists()
+            if not (np.isfinite(rollout.all_obs).all() and np.isfinite(self.log.returns).all()):
+                raise envs.UsageError(f"in episode {episode + 1} an observation or a reward of the world is not finite{kept}.")
             raise envs.UsageError(
                 f"in episode {episode + 1} the policies' numbers are no longer finite; a step size, the bonus's weight or a"
-                f" penalty of the world is too large{', and the last checkpoint is kept' * self.checkpoint.exists()}."
+                f" penalty of the world is too large{kept}."
             )
         self.log.add(episode, rollout.reward[:, :, 0], rollout.lengths, rollout.outcomes)
         figures = {f"charts/{name}": values for name, values in figures.items()} | {"losses/entropy": rollout.entropy}
@@ -418,6 +436,12 @@ def commit_of(directory):
     return ""
 
 
+def source_of(script, world):
+    """A checksum of a script's file and of a world's, by which one sees that either has been edited."""
+    files = (script, Path(inspect.getfile(type(world))))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+
+
 def say(line):
     """Print a line at once; UsageError if nobody can take it, such as a full disk."""
     try:
@@ -436,7 +460,10 @@ def play_episode(rollout, policy, generators):
 
 
 def play_teams(args, world, team, num_episodes, video):
-    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log."""
+    """Play episodes with every trial's team, write the first team's first one as a GIF, and return their log.
+
+    A world that cannot be drawn gives no GIF.
+    """
     policy, teams = team.policy, args.num_trials
     rollout = envs.Rollout(world, teams, head=getattr(policy, "head", envs.softmax), greedy=args.greedy)
     generators = [np.random.default_rng(seed) for seed in np.random.SeedSequence(args.seed).spawn(teams)]
@@ -446,11 +473,12 @@ def play_teams(args, world, team, num_episodes, video):
         if not rollout.finite:
             raise envs.UsageError("the policies' numbers are not finite, so they say nothing of what to do.")
         log.add(episode, rollout.reward[:, :, 0], rollout.lengths, rollout.outcomes)
-        if episode == 0:
+        if episode == 0 and world.drawable:
             rewards = ["start", *(f"step {t + 1}   reward {rollout.reward[t, 0, 0]:+g}" for t in range(rollout.lengths[0]))]
             frames = [envs.draw(world, rollout.states[t, 0], caption=caption) for t, caption in enumerate(rewards)]
-    with writing_to(video):
-        envs.save_gif(video, frames)
+    if frames:
+        with writing_to(video):
+            envs.save_gif(video, frames)
     return log
 
 
@@ -498,7 +526,8 @@ def evaluate(given, script):
     args.seed, args.greedy = given.seed, given.greedy
     log = play_teams(args, world, team, num_episodes, video)
     played = f"{num_episodes} episode{'s' * (num_episodes > 1)} of {args.num_trials} team{'s' * (args.num_trials > 1)}"
-    say(f"{given.evaluate}: {played}, {log.summary(slice(None))}; one of them in {video}")
+    film = f"; one of them in {video}" if world.drawable else ""
+    say(f"{given.evaluate}: {played}, {log.summary(slice(None))}{film}")
 
 
 def option(name):

@@ -129,6 +129,7 @@ def explored(world):
     if len(following) > limit:
         said = f"{limit} states, with {num_joint} joint actions in each,"
         raise UsageError(f"only worlds of at most {said} can be searched, and this {world.name} has more.")
+    world.check_outcomes(max(0, -following.min()))
     return joint, following, reward
 
 

@@ -31,7 +31,11 @@ class EpisodeLog:
         self.outcomes = np.zeros((num_trials, num_episodes), np.int8)
 
     def add(self, episode: int, reward, lengths, outcomes):
-        """Keep one episode of every trial: reward [T, num_trials] (0 after its end), lengths and outcomes [num_trials]."""
+        """Keep one episode of every trial: reward [T, num_trials] (0 after its end), lengths and outcomes [num_trials].
+
+        UsageError for an outcome that is none of the world's.
+        """
+        self.world.check_outcomes(outcomes)
         self.returns[:, episode] = reward.sum(0)
         self.lengths[:, episode] = lengths
         self.outcomes[:, episode] = outcomes

@@ -11,12 +11,14 @@ from pathlib import Path
 from envs.base import UsageError, World
 from envs.cleaner import Cleaner
 from envs.climbing import Climbing
+from envs.command import one_line
 from envs.findtreasure import FindTreasure
 from envs.gotogether import GoTogether
 from envs.movebox import MoveBox
 from envs.passage import Passage
 from envs.pushbox import PushBox
 from envs.secretroom import SecretRoom
+from envs.tryout import try_out
 
 # The paper's, and those on which others judge exploration and coordination.
 WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox, Climbing, Passage, SecretRoom)}
@@ -41,7 +43,21 @@ def make_world(name: str, **options) -> World:
         if option not in accepted:
             takes = f"takes {', '.join(accepted)}" if accepted else "has none"
             raise UsageError(f"{name} has no option {option!r}; it {takes}.")
-    return world(**options)
+    return world(**options) if name in WORLDS else own_world(world, name, options)
+
+
+def own_world(world, name, options):
+    """A world of a class that somebody has written, tried out; UsageError for whatever is wrong with it."""
+    try:
+        made = world(**options)
+    except UsageError:
+        raise
+    except Exception as error:
+        raise UsageError(f"the world in {name} cannot be made: {type(error).__name__}: {one_line(error)}.") from error
+    if not hasattr(made, "max_steps"):
+        raise UsageError(f"the world in {name} must call super().__init__ in its own.")
+    try_out(made)
+    return made
 
 
 def world_in_file(path):
@@ -56,8 +72,7 @@ def world_in_file(path):
     except UsageError:
         raise
     except (Exception, SystemExit) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise UsageError(f"{path} cannot be imported: {type(error).__name__}: {reason}.") from error
+        raise UsageError(f"{path} cannot be imported: {type(error).__name__}: {one_line(error)}.") from error
     found = [
         value
         for value in vars(module).values()

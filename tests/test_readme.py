@@ -115,18 +115,38 @@ def test_the_example_of_a_world_works_wherever_a_name_does(folder):
     assert "my_world/decespg/sign-seeds1-3-episodes4" in said
 
 
-@pytest.mark.parametrize("policy", ["SharedPolicy(init, world, args.hidden)", "GRUPolicy(init, world)"])
-def test_other_networks_train_are_saved_and_play(policy, folder, tmp_path):
+def test_the_example_of_a_world_with_observations_of_its_own_works(folder):
+    (folder / "vault.py").write_text(example("class Vault"))
+    assert re.search(r"out +8 +10 ", python(folder, "-c", "import envs; print(envs.optimum('vault.py'))"))
+    optimum = python(folder, "-c", "import envs; w = envs.make_world('vault.py'); print(envs.optimal_plan(w).T.tolist())")
+    assert eval(optimum)[0][:3] == [0, 0, 2]
+    words = ["--env", "vault.py", "--num-episodes", 5, "--num-trials", 2]
+    for name in ("decespg", "coma", "edti"):
+        assert "2 trials, usual end: " in python(folder, ROOT / "algos" / f"{name}.py", *words)
+
+
+@pytest.mark.parametrize(
+    ("script", "policy"),
+    [
+        ("pg", "SharedPolicy(init, world, args.hidden)"),
+        ("decespg", "SharedPolicy(init, world, args.hidden)"),
+        ("pg", "GRUPolicy(init, world)"),
+        ("epg", "GRUPolicy(init, world)"),
+    ],
+)
+def test_other_networks_train_are_saved_and_play(script, policy, folder, tmp_path):
     name = policy.partition("(")[0]
     changed = (
-        (ROOT / "algos" / "pg.py")
+        (ROOT / "algos" / f"{script}.py")
         .read_text(encoding="utf-8")
         .replace("def build(", example(f"class {name}") + "\n\ndef build(", 1)
     )
     made = "StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])"
     changes = {made: policy, "rollout.play(team.policy.params, act)": "rollout.play_with(team.policy.player(), act)"}
     if name == "GRUPolicy":
-        changes["        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)\n"] = ""
+        changes[
+            "        log_probs = torch.log_softmax(team.policy(rollout.obs), dim=-1)  # of each distinct observation, once\n"
+        ] = ""
         changes["rollout.of_taken(log_probs)"] = "team.policy.log_probs(rollout)"
     for old, new in changes.items():
         assert changed.count(old) == 1

@@ -7,6 +7,7 @@ import torch
 import envs
 from algos import pg
 from envs.rollout import draw_action
+from envs.tryout import try_out
 from tests.helpers import RACE, assert_one_sentence, assert_refused
 
 TRIALS = 3
@@ -358,6 +359,25 @@ def test_an_edited_world_plays_by_its_new_rules(tmp_path):
         assert envs.optimum(str(path), size=4).fewest["there"].total == pytest.approx(reward - 0.2)
 
 
+@pytest.mark.parametrize("name", envs.WORLDS)
+def test_the_worlds_themselves_pass_what_ones_own_must(name):
+    try_out(envs.make_world(name))
+
+
+def edited_race(old, new):
+    """The text of the test's world with a mistake."""
+    text = RACE.read_text(encoding="utf-8")
+    assert old in text
+    return text.replace(old, new)
+
+
+def race_that_sees(lines):
+    """The text of the test's world with another `observe`."""
+    text = edited_race("class Race", f"@envs.rule\ndef observe(rules, cell, state, obs):\n    {lines}\n\n\nclass Race")
+    call = next(line for line in text.splitlines() if "super().__init__" in line)
+    return text.replace(call, f"{call}\n        self.observe = observe")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -379,12 +399,39 @@ def test_an_edited_world_plays_by_its_new_rules(tmp_path):
         ),
         (
             RACE.read_text(encoding="utf-8").replace("REWARD, 1", "REWARD").replace("-0.1, 0", "-0.1"),
-            "race's step must return a reward and an outcome, not float64",
+            "race's step must return a reward and a whole number as outcome, not float64",
         ),
         (
             RACE.read_text(encoding="utf-8").replace("best_outcome = 1", "best_outcome = 2"),
             "must be one of its 1 outcomes, or 0",
         ),
+        (edited_race("-0.1, 0", "0, -0.1"), "must return a reward and a whole number as outcome, not"),
+        (edited_race("REWARD, 1", "REWARD, 2"), "must return an outcome from 0 to 1, the number of its outcome_names, not 2"),
+        (edited_race("REWARD, 1", "REWARD, -1"), "must return an outcome from 0 to 1, the number of its outcome_names, not -1"),
+        (edited_race("REWARD = 10.0", "REWARD = np.nan"), "must return a finite number as its reward, not nan"),
+        (
+            edited_race("last = rules", "old = state.copy()\n    last = rules"),
+            "cannot be compiled: they may only read and write",
+        ),
+        (edited_race("(rules, state, actions)", "(state, actions)"), "cannot be compiled: Signature mismatch"),
+        (edited_race("np.array([[size]], np.int8)", '{"size": size}'), "cannot be compiled: Cannot determine Numba type of"),
+        (edited_race("step = staticmethod(step)", "step = step"), "compiled by envs.rule, in a staticmethod"),
+        (
+            edited_race("action_names", "actions"),
+            "cannot be made: AttributeError: 'Race' object has no attribute 'action_names'",
+        ),
+        (edited_race("super().__init__(rules, [0, 0, 1, 0], size,", "dict("), r"must call super\(\).__init__"),
+        (edited_race("num_agents=2", "num_agents=2.0"), "cannot be made: TypeError"),
+        (edited_race("range(2)", "range(3)"), "write beyond the end of the state"),
+        (edited_race("state[3] == last", "state[4] > 0"), "must be deterministic, .* or read beyond the end of an array"),
+        (edited_race("state[2 * i + 1] += 1", "state[2 * i + 1 + 2 * (i == 1)] += 1"), "write beyond the end of the state"),
+        (edited_race("-0.1, 0", "np.random.random(), 0"), "must be deterministic, .*: they draw random numbers"),
+        (race_that_sees("obs[:] = 1\n    obs[1, 4] = 1"), "write beyond the end of the observations"),
+        (
+            race_that_sees("if state[1] > 1:\n        obs[:] = 1"),
+            "write a finite number into all 4 entries .* entry 0 of agent 0's",
+        ),
+        (race_that_sees("obs[:] = np.inf"), "write a finite number into all 4 entries .* entry 0 of agent 0's"),
     ],
 )
 def test_a_file_without_a_world_says_what_is_wrong(text, said, tmp_path):
@@ -393,6 +440,60 @@ def test_a_file_without_a_world_says_what_is_wrong(text, said, tmp_path):
     with pytest.raises(envs.UsageError, match=said) as error:
         envs.make_vec(str(path)).world.compiled  # noqa: B018
     assert_one_sentence(str(error.value))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (dict(state_scale=[1, 1, 1]), r"race's state_scale must be numbers \[4\], and they are \[3\]"),
+        (dict(state_scale=[1, 1, 1, "wide"]), "race's state_scale must be numbers, not"),
+        (dict(local_index=[[0], [1], [2]]), r"race's local_index must be numbers \[2, any\], and they are \[3, 1\]"),
+        (dict(local_index=[[0], [4]]), "race's local_index must name entries of the state, 0 to 3"),
+        (dict(start=[[0, 0, 1, 0]]), r"race's start must be numbers \[any\], and they are \[1, 4\]"),
+        (dict(num_agents=2.0), "race's num_agents must be a whole number of at least 1, not 2.0"),
+        (dict(obs_dim=0), "race's obs_dim must be a whole number of at least 1, not 0"),
+    ],
+)
+def test_numbers_that_do_not_describe_a_world(changed, said):
+    kind = type(envs.make_world(str(RACE)))
+    numbers = dict(
+        start=[0, 0, 1, 0], local_index=[[0], [1]], num_agents=2, obs_dim=4, cell=1, state_scale=[1] * 4, max_steps=9
+    )
+
+    class Race(envs.World):
+        action_names, step, observe = kind.action_names, staticmethod(kind.step), staticmethod(envs.base.observe_own)
+
+        def __init__(self, changed):
+            super().__init__(np.array([[4]], np.int8), **{**numbers, **changed})
+
+    assert Race({}).obs_dim == 4
+    with pytest.raises(envs.UsageError, match=said) as error:
+        Race(changed)
+    assert_one_sentence(str(error.value))
+
+
+def test_an_outcome_without_a_name_is_refused_whenever_it_comes():
+    log = envs.EpisodeLog(envs.make_world("pushbox"), 2, 1)
+    names = len(log.world.outcome_names)
+    log.add(0, np.zeros((1, 2)), np.ones(2), np.array([0, names]))
+    for outcome in (-1, names + 1):
+        said = f"must return an outcome from 0 to {names}, the number of its outcome_names, not {outcome}"
+        assert_refused(said, log.add, 0, np.zeros((1, 2)), np.ones(2), np.array([0, outcome]))
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        (np.full((2, 2, 4), -np.log(4)), "not logits"),
+        (np.array([0.5, 0.5, 0.5, 0.5]) * np.ones((2, 2, 4)), "adding up to 1"),
+        (np.full((2, 2, 3), 1 / 3), "probabilities of all actions, [2, 2, 4], not [2, 2, 3] numbers"),
+        (np.full((4, 4), 1 / 4), "probabilities of all actions, [2, 2, 4], not [4, 4] numbers"),
+    ],
+)
+def test_a_policy_must_say_probabilities(told, said):
+    rollout = envs.Rollout(envs.make_world("pushbox", max_steps=3), 2)
+    assert_refused(said, rollout.play_with, lambda obs: told, generators(1, 2))
+    rollout.play_with(lambda obs: np.full((2, 2, 4), 0.25, np.float32), generators(1, 2))
 
 
 def test_the_options_of_a_world_of_ones_own():

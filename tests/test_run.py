@@ -24,9 +24,10 @@ from PIL import Image
 
 import envs
 from algos import decespg, pg
-from envs import run
+from envs import run, worlds
 from tests.helpers import (
     ALGOS,
+    RACE,
     assert_one_sentence,
     assert_refusal,
     assert_same_results,
@@ -117,7 +118,7 @@ def test_args_json_holds_all_resolved_arguments_and_versions(finished):
     assert about["args"].items() >= dict(given, gamma=0.98, optimizer="sign", learning_rate=1e-3).items()
     assert [name for name, value in about["args"].items() if value is None] == ["evaluate"]
     assert about["torch"] == version("torch")
-    assert {"python", "numpy", "numba", "gymnasium", "commit"} <= about.keys()
+    assert {"python", "numpy", "numba", "gymnasium", "commit", "source"} <= about.keys()
 
 
 def test_the_episodes_agree_with_each_other(finished):
@@ -547,6 +548,41 @@ def test_numbers_that_are_no_longer_finite_end_the_run_with_the_episode(tmp_path
     assert sentence.startswith("pg.py: in episode ")
     assert "the policies' numbers are no longer finite; a step size" in sentence
     assert not (tmp_path / "episodes.npz").exists()
+
+
+def test_an_observation_that_is_not_finite_is_not_blamed_on_the_step_size(tmp_path, monkeypatch):
+    monkeypatch.setattr(worlds, "try_out", lambda world: None)  # as where random play does not come to it
+    world = tmp_path / "race.py"
+    see = "@envs.rule\ndef observe(rules, cell, state, obs):\n    obs[:] = np.inf\n\n\nclass Race"
+    text = RACE.read_text(encoding="utf-8").replace("class Race", see)
+    call = next(line for line in text.splitlines() if "super().__init__" in line)
+    world.write_text(text.replace(call, f"{call}\n        self.observe = observe"))
+    ended = command("pg", "--env", world, "--num-episodes", 50, "--run-dir", tmp_path / "run")
+    assert ended.code == 2
+    assert "pg.py: in episode 1 an observation or a reward of the world is not finite." in ended.err
+
+
+def test_a_part_that_could_not_be_saved_is_refused_before_anything_is_done(tmp_path, monkeypatch):
+    monkeypatch.setattr(decespg, "SelectiveMemory", lambda *_, **__: SimpleNamespace(state=[[1.0]]))
+    ended = command("decespg", "--num-episodes", 5, "--run-dir", tmp_path / "run")
+    assert_refusal("decespg", ended, "the team's memory, a SimpleNamespace, must list its arrays and tensors")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_world_without_a_picture_is_refused_a_film_at_once_and_evaluated_without(tmp_path):
+    world = tmp_path / "race.py"
+    text = RACE.read_text(encoding="utf-8").replace("PositionWorld", "World").replace("def sketch", "def outline")
+    see = "@envs.rule\ndef observe(rules, cell, state, obs):\n    obs[:] = cell\n\n\nclass Race"
+    numbers = "start=[0, 0, 1, 0], local_index=[[0], [2]], num_agents=2, obs_dim=3, cell=1, state_scale=[1] * 4, max_steps=9"
+    call = next(line for line in text.splitlines() if "super().__init__" in line)
+    text = text.replace("class Race", see).replace(call, f"        super().__init__(rules, {numbers})")
+    world.write_text(text.replace("    step = static", "    observe = staticmethod(observe)\n    step = static"))
+    words = ["--env", world, "--num-episodes", 5, "--save-model", "--run-dir", tmp_path / "run"]
+    assert_refusal("pg", command("pg", *words, "--capture-video"), "race cannot be drawn")
+    assert not (tmp_path / "run").exists()
+    assert command("pg", *words).code == 0
+    ended = command("pg", "--evaluate", tmp_path / "run" / "policy.pt", "--num-episodes", 4)
+    assert (ended.code, "4 episodes of 1 team" in ended.out, ".gif" in ended.out) == (0, True, False)
 
 
 def test_a_learnt_model_that_is_no_longer_finite_ends_the_run(tmp_path):

@@ -3,6 +3,7 @@
 import io
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image
 import envs
 from envs import __main__ as terminal
 from envs import gallery
-from tests.helpers import RACE
+from tests.helpers import RACE, assert_refused
 
 
 def run(module, monkeypatch, *words, typed=""):
@@ -36,6 +37,20 @@ def test_an_episode_by_the_keyboard(monkeypatch, capsys):
     assert "agent 0 observes 0 0 1 0 0  [empty]\n" in printed
     assert "agent 1 observes 0 1 0 0 0  [large box]\n" in printed
     assert printed.endswith("end: large after 4 steps, return 100, 33.33 per step\n")
+
+
+def test_every_action_has_a_letter_of_its_own():
+    names = ("stay", "north", "south", "turn west", "Ö")
+    assert terminal.letters_of(names) == {"s": 0, "n": 1, "o": 2, "w": 3, "a": 4}
+    assert_refused("at most 36 actions", terminal.letters_of, ("go",) * 37)
+
+
+def test_numbers_that_are_no_positions_are_told_as_they_are():
+    env = envs.make("movebox")
+    world = SimpleNamespace(num_agents=1, sights=(), cell=1.0)
+    said = terminal.describe(SimpleNamespace(render=lambda: "map", world=world), {"agent_0": np.array([0.5, 1, 0])})
+    assert said == "map\nagent 0 observes 0.5 1 0"
+    assert "[(13, 1)" in terminal.describe(SimpleNamespace(render=lambda: "map", world=env.world), env.reset()[0])
 
 
 def test_the_end_of_the_input_ends_the_episode(monkeypatch, capsys):
