@@ -139,10 +139,15 @@ class Cell:
     @cached_property
     def settings(self):
         """Everything that the result depends on: the arguments with their defaults filled in, as args.json holds them."""
-        module = script(self.method)
-        args, _ = run.resolve(self.parsed(), module.WORLDS, module.TUNED, module.OTHER)
+        args, _ = self.resolved
         values = {name: value for name, value in vars(args).items() if name not in run.HOUSEKEEPING}
         return json.loads(json.dumps({"method": path_of(self.method).stem, **values}))
+
+    @property
+    def resolved(self):
+        """The script's arguments with their defaults filled in, and the world."""
+        module = script(self.method)
+        return run.resolve(self.parsed(), module.WORLDS, module.TUNED, module.OTHER)
 
     @property
     def name(self):
@@ -173,6 +178,15 @@ class Cell:
     def finished(self):
         """Whether the result is there, complete and from these settings."""
         return (self.run_dir / "episodes.npz").exists() and not self.broken
+
+    @property
+    def edited(self):
+        """Whether the script or the world's file is not what it was when the run that is there began."""
+        with contextlib.suppress(OSError, ValueError):
+            about = json.loads((self.run_dir / "args.json").read_text(encoding="utf-8"))
+            now = run.source_of(path_of(self.method), self.resolved[1])
+            return about.get("source", now) != now
+        return False
 
     @property
     def broken(self):

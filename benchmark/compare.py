@@ -57,6 +57,8 @@ class Args:
     """seconds between two checkpoints of a cell"""
     runs: Path = RUNS
     """directory under which the cells work"""
+    overwrite: bool = False
+    """run the selected cells anew, also those that are finished or stopped"""
     dry_run: bool = False
     """only list the cells, their numbers and states"""
     status: bool = False
@@ -309,12 +311,23 @@ def show_states(cells):
         print(f"{number:>4}  {cell.name:<60} {word:<9} {detail}".rstrip())
 
 
+def remove(cells):
+    """Remove what the cells have left, as --overwrite asks; UsageError if one of them is running."""
+    for cell in cells:
+        if not cell.run_dir.exists():
+            continue
+        with owned(cell, wait=False) as lock:
+            if lock is None:
+                raise envs.UsageError(f"{cell.name} is running; stop it before --overwrite, or wait for its end.")
+            shutil.rmtree(cell.run_dir)
+
+
 def submit(args, cells):
     """Submit one job array over the unfinished cells; a task runs `./benchmark.sh <the same selection> --cell <its number>`."""
     numbers = [number for number, cell in enumerate(cells) if state(cell) not in ("finished", "running")]
     if not numbers:
         return print("All cells are finished or running.")
-    own = [word for word in sys.argv[1:] if word != "--slurm"]
+    own = [word for word in sys.argv[1:] if word not in ("--slurm", "--overwrite")]
     files = {str(word): str(path_of(word)) for word in (*args.algos, *args.envs) if word.endswith(".py")}
     selected = [*(files.get(word, word) for word in own), "--runs", str(args.runs.absolute())]  # the caller's, wherever it runs
     (ROOT / "runs" / "slurm").mkdir(parents=True, exist_ok=True)
@@ -351,16 +364,21 @@ def run(args):
     cells, jobs = selection(args), jobs_of(args)
     if args.dry_run or args.status:
         return show_states(cells)
-    if args.slurm:
-        return submit(args, cells)
-    if args.cell is not None:
+    if args.cell is not None and not args.slurm:
         if not 0 <= args.cell < len(cells):
             raise envs.UsageError(f"--cell must be a number between 0 and {len(cells) - 1}, not {args.cell}.")
         cells = [cells[args.cell]]
+    if args.overwrite:
+        remove(cells)
     with contextlib.redirect_stdout(Forgiving(sys.stdout)):  # no cell is left out because nobody listens
         for cell in cells:
             if cell.broken:
                 print(f"{cell.broken}; it is run again.")
+            elif cell.edited:
+                did = "has finished" if cell.finished else "has begun"
+                print(f"{cell.name} {did} before its script or its world was edited; --overwrite runs it anew.")
+        if args.slurm:
+            return submit(args, cells)
         skipped = [cell for cell in cells if cell.finished]
         runner = Runner([cell for cell in cells if cell not in skipped], jobs, args.checkpoint_every)
         ended = runner.run()

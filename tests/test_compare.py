@@ -18,7 +18,7 @@ import pytest
 
 from benchmark import compare, figures, report, results
 from benchmark.cells import ROOT, Cell, seconds_of, select
-from tests.helpers import assert_one_sentence, assert_refused, script
+from tests.helpers import RACE, assert_one_sentence, assert_refused, script
 
 BLOCK = dict(first_seed=5, num_trials=2, num_episodes=6000)
 
@@ -317,6 +317,48 @@ def test_a_failure_is_shown_with_its_last_line_and_its_command(tmp_path, monkeyp
     assert said.count("again: ") == 2
     _, said, _ = command(monkeypatch, capsys, *SMALL, "--status", "--runs", tmp_path)
     assert said.count("failed    the reason") == 2
+
+
+def test_a_cell_of_an_edited_script_is_said_and_run_again_only_if_asked(tmp_path, monkeypatch, capsys):
+    mine, world = tmp_path / "mine.py", tmp_path / "race.py"
+    mine.write_text((ROOT / "algos" / "pg.py").read_text(encoding="utf-8"))
+    world.write_text(RACE.read_text(encoding="utf-8"))
+    selected = [
+        "--algos",
+        mine,
+        "--envs",
+        world,
+        "--optimizers",
+        "sign",
+        "--seeds",
+        1,
+        "--episodes",
+        2,
+        "--runs",
+        tmp_path / "runs",
+    ]
+    said = "mine/sign-seeds1-1-episodes2 has finished before its script or its world was edited; --overwrite runs it anew."
+    for edited in (None, mine, world):
+        if edited is not None:
+            edited.write_text(edited.read_text(encoding="utf-8") + "# edited\n")
+            _, out, _ = command(monkeypatch, capsys, *selected)
+            assert said in out
+            assert "0 finished, 0 failed, 1 skipped" in out
+        _, out, _ = command(monkeypatch, capsys, *selected, "--overwrite")
+        assert said not in out
+        assert "1 finished, 0 failed, 0 skipped" in out
+        _, out, _ = command(monkeypatch, capsys, *selected)
+        assert said not in out
+        assert "0 finished, 0 failed, 1 skipped" in out
+
+
+def test_what_is_running_is_not_overwritten(tmp_path, monkeypatch, capsys):
+    cell = Cell("pg", "pushbox", "sign", num_trials=1, num_episodes=2, runs=tmp_path)
+    finish(cell)
+    with compare.owned(cell):
+        code, _, error = command(monkeypatch, capsys, *SMALL, "--overwrite", "--runs", tmp_path)
+    assert (code, "is running; stop it before --overwrite" in error) == (2, True)
+    assert cell.finished
 
 
 def test_a_broken_result_is_said_and_run_again(tmp_path, monkeypatch, capsys):
