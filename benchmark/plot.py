@@ -9,6 +9,7 @@ trials have no interval.
 """
 
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,13 +94,20 @@ def interval(values):
     return np.quantile(values[draws].mean(1), (0.025, 0.975), axis=0)
 
 
-def compare(one, other):
+def decimals_of(groups, world):
+    """With how many decimals a world's rewards are told: 2, or so many that the largest mean has three figures."""
+    largest = max(abs(group.last.mean()) for group in groups if group.world == world)
+    return max(2, 2 - math.floor(math.log10(largest))) if largest > 0 else 2
+
+
+def compare(one, other, decimals=2):
     """What `one` has more than `other`, in words: over the trials of the same seeds, and the probability of improvement."""
     seeds = sorted(set(one.seeds) & set(other.seeds))
     same = [SimpleNamespace(last=group.last[np.isin(group.seeds, seeds)]) for group in (one, other)]
     scores = {"one": one.last[:, None], "other": other.last[:, None]}
     better, *shares = measures.improvements(scores, over="one")["other"]
-    words = "{:+.2f} [{:+.2f}, {:+.2f}]".format(*measures.difference(*same)) if len(seeds) >= FEWEST else "-"
+    difference = [f"{value:+.{decimals}f}" for value in measures.difference(*same)] if len(seeds) >= FEWEST else []
+    words = "{} [{}, {}]".format(*difference) if difference else "-"
     enough = min(map(len, (one.seeds, other.seeds))) >= FEWEST
     return [words, f"{better:.2f}" + (" [{:.2f}, {:.2f}]".format(*shares) if enough else "")]
 
@@ -131,14 +139,17 @@ def draw(groups, path):
 def tables(groups):
     """The scores of all, and in each world the differences to the first."""
     scores, differences = [["world", "curve", "trials", "episodes", "reward per step", "95 % interval", "worst trial"]], []
+    decimals = {group.world: decimals_of(groups, group.world) for group in groups}
     for group in groups:
-        bounds = "[{:.2f}, {:.2f}]".format(*interval(group.last)) if len(group.seeds) >= FEWEST else "-"
-        words = [str(len(group.seeds)), str(group.score.shape[1]), f"{group.last.mean():.2f}", bounds]
-        scores.append([group.world, group.label, *words, f"{group.last.min():.2f}"])
+        numbers = (group.last.mean(), *interval(group.last), group.last.min())
+        mean, low, high, worst = (f"{number:.{decimals[group.world]}f}" for number in numbers)
+        bounds = f"[{low}, {high}]" if len(group.seeds) >= FEWEST else "-"
+        scores.append([group.world, group.label, str(len(group.seeds)), str(group.score.shape[1]), mean, bounds, worst])
     firsts = {group.world: group for group in reversed(groups)}
     for group in (group for group in groups if group is not firsts[group.world]):
         first = firsts[group.world]
-        differences.append([group.world, f"{group.label} - {first.label}", *compare(group, first)])
+        words = compare(group, first, decimals[group.world])
+        differences.append([group.world, f"{group.label} - {first.label}", *words])
     return scores, [["world", "curves", "difference", "probability of improvement"], *differences]
 
 

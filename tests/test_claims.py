@@ -104,6 +104,9 @@ def test_the_best_of_the_others_is_who_counts():
         ("most", "no yes no no open open", "not reproduced under sign (2 of 6 cases open)"),
         ("all", "yes yes no yes", "only under adam"),
         ("all", "yes yes undecided yes", "partly"),
+        ("all", "no yes no open", "not reproduced under sign (1 of 4 cases open)"),
+        ("all", "no yes open open", "not reproduced under sign (2 of 4 cases open)"),
+        ("all", "yes yes open open", "open"),
     ],
 )
 def test_the_verdict_on_a_whole_claim(scope, verdicts, word):

@@ -47,6 +47,18 @@ def test_another_task_is_named_beside_another_method():
     assert [group.label for group in plot.groups_of(found)] == ["pg env_args=", "mappo env_args=size=7 num_agents=3"]
 
 
+def test_small_rewards_have_more_decimals():
+    def first(*means):
+        groups = [Group(f"run {k}", "my_world", range(5), np.full((5, 20), mean)) for k, mean in enumerate(means)]
+        scores, differences = plot.tables(groups)
+        return [row[4] for row in scores[1:]] + [row[2] for row in differences[1:]]
+
+    assert first(0.0152, 0.002) == ["0.0152", "0.0020", "-0.0132 [-0.0132, -0.0132]"]
+    assert first(0.152, 0.002) == ["0.152", "0.002", "-0.150 [-0.150, -0.150]"]
+    assert first(-15.2, 3.126) == ["-15.20", "3.13", "+18.33 [+18.33, +18.33]"]
+    assert first(0.0) == ["0.00"]
+
+
 def test_differences_are_those_of_the_same_seeds():
     noise = np.random.default_rng(0).normal(scale=100, size=(20, 1))
     one, other = (Group("", "pushbox", tuple(range(20)), noise + shift) for shift in (2.0, 0.0))
