@@ -16,10 +16,10 @@ import pytest
 
 import envs
 from envs.run import RunArgs
+from tests.helpers import SCRIPTS
 
 ROOT = Path(envs.__file__).parents[1]
 METHODS = ROOT / "docs" / "methods"
-SCRIPTS = sorted(path.stem for path in (ROOT / "algos").glob("*.py"))
 WORLDS = list(envs.WORLDS)
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PARTS = [
