@@ -49,7 +49,7 @@ def played(world, joint, filler):
         yield state.tolist(), obs.tolist(), reward, outcome
         steps += 1
         if outcome or steps == world.max_steps:
-            steps, state[:] = 0, world.start
+            state[:], steps = world.start, 0
 
 
 def with_room(array, filler):

@@ -23,6 +23,8 @@ from envs.tryout import try_out
 # The paper's, and those on which others judge exploration and coordination.
 WORLDS = {world.name: world for world in (Cleaner, FindTreasure, GoTogether, MoveBox, PushBox, Climbing, Passage, SecretRoom)}
 
+TRIED = set()  # files and options of worlds that need not be tried out again, as for each cell of a sweep
+
 
 def make_world(name: str, **options) -> World:
     """The world `name`, or the one in the file `name` (such as "my_world.py"), with its options.
@@ -56,7 +58,9 @@ def own_world(world, name, options):
         raise UsageError(f"the world in {name} cannot be made: {type(error).__name__}: {one_line(error)}.") from error
     if not hasattr(made, "max_steps"):
         raise UsageError(f"the world in {name} must call super().__init__ in its own.")
-    try_out(made)
+    if (known := (Path(name).read_bytes(), repr(options))) not in TRIED:
+        try_out(made)
+        TRIED.add(known)
     return made
 
 
