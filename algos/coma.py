@@ -48,7 +48,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/coma.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-2),
-    ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3),
     ("findtreasure", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
     ("findtreasure", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-2),
     ("gotogether", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
@@ -75,11 +75,11 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
+    """step size of critics, which always have a persistent Adam (None: see TUNED; 0.003 in other worlds)"""
     td_lambda: Annotated[float, Between(0, 1)] = 0.8
     """lambda of the critics' targets: 0 looks one step ahead, 1 to the end of the episode (Foerster et al.)"""
     target_critic_every: Annotated[int, AtLeast(1)] = 200

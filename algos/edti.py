@@ -80,11 +80,11 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     critic_learning_rate: Annotated[float | None, AtLeast(0)] = None
-    """step size of critics, which always have a persistent Adam (None: tuned for world and optimiser; 0.003 in other worlds)"""
+    """step size of critics, which always have a persistent Adam (None: see TUNED; 0.003 in other worlds)"""
     gae_lambda: Annotated[float, Between(0, 1)] = 0.95
     """lambda of the advantages: 0 looks one step ahead, 1 to the end of the episode (Schulman et al., 2016)"""
     eta: Annotated[float | None, AtLeast(0)] = None

@@ -4,8 +4,9 @@ The team remembers its last m joint pairs u = (o_1, a_1, .., o_n, a_n). A Gaussi
 visited, eta(u) in (0, 1] (Eqs. 5-7), and the reward of all agents becomes r' = r + beta EB(u) with EB(u) = -log eta(u)
 (Eqs. 8-9); Eq. 14 climbs along it.
 
-Where all agents observe the same positions (all worlds but pushbox), u holds these n times, so that a squared distance counts n
-times and the kernel is as narrow as decespg.py's with sigma / sqrt(n). That is left so: sigma is the width of Eq. 5 in u.
+Where all agents observe the same positions (by default in all worlds but pushbox and climbing), u holds these n times, so that
+a squared distance counts n times and the kernel is as narrow as decespg.py's with sigma / sqrt(n). That is left so: sigma is
+the width of Eq. 5 in u.
 
 Jiang & Amato, "Multi-Agent Reinforcement Learning with Directed Exploration and Selective Memory Reuse" (SAC 2021).
 
@@ -61,11 +62,11 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
-    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
+    """weight of the exploration bonus, in units of reward (Eq. 9; None: see TUNED; 0.1 in other worlds)"""
     window: Annotated[int, AtLeast(1)] = 50
     """visits that are remembered (m of Section 3.1.4)"""
     sigma: Annotated[float, AtLeast(1e-3)] = 0.5

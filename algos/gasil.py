@@ -4,7 +4,7 @@
 2. The team keeps its best episodes. Every agent's discriminator D(o, a) learns to tell their steps (label 0.9) from those of
    the current episode (label 0), and the agent's reward becomes r' = r + beta EB(u) + lambda_im r_im, where
    r_im = clip(-log(1 - clip(D, 0.01, 0.99)) + log 1/2, -1/2, 3/2)
-   is positive for what good episodes do more often than the current one, and negative for what they do less often.
+   is positive for what good episodes do over 1.25 times as often as the current one, and else negative.
 
 Hao et al., "Independent Generative Adversarial Self-Imitation Learning in Cooperative Multiagent Systems" (AAMAS 2019). Labels,
 r_im, the curve of lambda_im, the number of good episodes, without which nobody imitates, and D's layers, Adam (0.5, 0.9) and
@@ -53,7 +53,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/gasil.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-3, beta=0.01, lambda_im=0.3, rise=430),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, lambda_im=0.3, rise=430),
+    ("cleaner", "adam"): dict(learning_rate=1e-3, beta=0.01, lambda_im=0.3, rise=430),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=30.0, rise=215),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.3, lambda_im=30.0, rise=215),
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=0.3, rise=215),
@@ -73,11 +73,11 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     beta: Annotated[float | None, AtLeast(0)] = None
-    """weight of the exploration bonus, in units of reward (Eq. 9; None: tuned for world and optimiser; 0.1 in other worlds)"""
+    """weight of the exploration bonus, in units of reward (Eq. 9; None: see TUNED; 0.1 in other worlds)"""
     window: Annotated[int, AtLeast(1)] = 50
     """visits that are remembered (m of Section 3.1.4)"""
     sigma: Annotated[float, AtLeast(1e-3)] = 0.5
@@ -305,7 +305,7 @@ def step_shares(obs, actions, lengths, num_actions):
 
 
 def imitation_reward(d):
-    """r_im = -log(1 - D) + log 1/2, kept in [-1/2, 3/2]; D = 1/2, where good and own steps look alike, gives 0."""
+    """r_im = -log(1 - D) + log 1/2, kept in [-1/2, 3/2]; 0 at D = 1/2, less where steps look alike (D = label / 2)."""
     return (np.log(0.5) - np.log(1 - np.clip(d, 0.01, 0.99))).clip(-0.5, 1.5)
 
 

@@ -65,7 +65,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
 

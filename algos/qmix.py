@@ -54,7 +54,7 @@ WORLDS = {
 TUNED = {
     ("cleaner", "adam"): dict(learning_rate=3e-4, exploration=0.2),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, exploration=0.2),
-    ("gotogether", "adam"): dict(learning_rate=1e-3, exploration=0.2),
+    ("gotogether", "adam"): dict(learning_rate=3e-3, exploration=0.2),
     ("movebox", "adam"): dict(learning_rate=3e-4, exploration=0.2),
     ("pushbox", "adam"): dict(learning_rate=1e-3, exploration=0.2),
     ("climbing", "adam"): dict(learning_rate=3e-4, exploration=0.1),

@@ -62,7 +62,7 @@ class Args(RunArgs):
     gamma: Annotated[float | None, Between(0, 1)] = None
     """discount factor (None: Table 1; 0.99 in other worlds)"""
     optimizer: Literal["sign", "adam"] = "sign"
-    """of the policies: sign descent (a fresh Adam in every update, what the paper's figures show) or a persistent Adam"""
+    """of the policies: sign descent (a fresh Adam in every update, as in the authors' scripts) or a persistent Adam"""
     learning_rate: Annotated[float | None, AtLeast(0)] = None
     """step size of the agents' networks (None: tuned, see TUNED; 0.001 in other worlds)"""
     slots: Annotated[int | None, AtLeast(0)] = None
@@ -138,7 +138,7 @@ class SelectiveMemory:
         """The second term of Eq. 16, sum_i w_i g_i with w_i = Psi*_i / sum_j Psi*_j, as weights of log pi(a | o).
 
         g_i = 1/T_i sum_t G*_t grad log pi(a*_t | o*_t) is Eq. 15. Only episodes of positive value are replayed, which Eq. 16
-        does not say; but of a sum that is 0 or negative there are no shares. Every distinct observation is there once:
+        does not say; but a sum that is 0 or negative defines no shares. Every distinct observation is there once:
         obs [num_nets, M, obs_dim], and the weights of all actions there [num_nets, M, num_actions].
         What is stored does not change, so the steps are merged again only when a better episode has come.
         """

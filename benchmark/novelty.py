@@ -15,19 +15,17 @@ from itertools import count
 from pathlib import Path
 from unittest.mock import patch
 
-import matplotlib
 import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from matplotlib import pyplot as plt
+
 import envs
 from benchmark.cells import METHODS, ROOT, check_words, name_of, script, train_aside
 from benchmark.figures import DASHES, check_picture, colour_of
 from benchmark.report import markdown
 from envs.command import command_line
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 VISITS = 100
 

@@ -16,19 +16,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Annotated
 
-import matplotlib
 import numpy as np
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from matplotlib import pyplot as plt
+
 import envs
 from benchmark import measures
 from benchmark.cells import settings_of
 from benchmark.report import markdown
 from envs.command import command_line
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 POINTS = 100  # of the longest curve in a panel
 RESAMPLES = 2000  # of the bootstrap

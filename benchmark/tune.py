@@ -6,8 +6,8 @@ paper's figures play no part.
 
 In the worlds with large networks, cleaner and movebox, memories keep 3 episodes for each end instead of 10, which takes a third
 of the time for replay: DecESPG with 3 is not worse than with 10 by more than a standard error of that (5 trials of the grid's
-length: cleaner 0.267 and 0.268 +- 0.007, movebox 0.95 and 0.46 +- 0.12 under sign, 1.35 and 1.73 +- 0.62 under adam). So it is
-for SPG, whose own number that is (movebox, sign: 1.09 and 1.36 +- 0.47).
+length, at rates chosen before: cleaner 0.267 and 0.268 +- 0.007, movebox 0.95 and 0.46 +- 0.12 under sign, 1.35 and 1.73 +-
+0.62 under adam). So it is for SPG, whose own number that is (movebox, sign: 1.09 and 1.36 +- 0.47).
 
     python benchmark/tune.py pg decespg --jobs 2         # adds what is missing in benchmark/tuning/pg.csv and decespg.csv
 

@@ -9,19 +9,17 @@ from pathlib import Path
 from typing import Literal
 from unittest.mock import patch
 
-import matplotlib
 import numpy as np
 import tyro
 from matplotlib.colors import LogNorm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from matplotlib import pyplot as plt
+
 import envs
 from benchmark.cells import BEYOND, METHODS, ROOT, WORLDS, check_words, name_of, script, takes_optimizer, train_aside
 from benchmark.figures import agent_places, check_picture
 from envs.command import command_line
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 CELL = 24  # pixels
 

@@ -351,3 +351,8 @@ def test_gasil_keeps_the_treasure_that_its_base_gives_up(tmp_path):
         found[lambda_im] = (log.outcomes[:, -60:] == 1).mean(1)
     assert found[0.0].max() < 0.1
     assert found[10.0].min() > 0.4
+
+
+def test_its_bonus_has_the_weight_that_the_rule_chose_for_decespg():
+    chosen = {pair: values["beta"] for pair, values in decespg.TUNED.items()}
+    assert {pair: values["beta"] for pair, values in gasil.TUNED.items()} == {pair: chosen[pair] for pair in gasil.TUNED}
