@@ -485,9 +485,9 @@ SENTENCES = (
     Sentence(
         "**EX2, learnt novelty, cannot be told from the Gaussian process** in FindTreasure, GoTogether and MoveBox (DecESPG "
         "minus EX2 is {movebox_sign} and {movebox_adam} under sign descent and Adam), in PushBox under sign descent and in "
-        "Cleaner under Adam ({cleaner_adam}). It is better in Cleaner under sign descent ({cleaner_sign}) and in PushBox under Adam "
-        "({pushbox_adam}); ICM and EMI keep the large box there in only {espg_icm_adam} and {espg_emi_adam} trials, under sign "
-        "descent in {espg_icm_sign} and {espg_emi_sign}.",
+        "Cleaner under Adam ({cleaner_adam}). It is better in Cleaner under sign descent ({cleaner_sign}) and in PushBox "
+        "under Adam ({pushbox_adam}); ICM and EMI keep the large box there in only {espg_icm_adam} and {espg_emi_adam} trials, "
+        "under sign descent in {espg_icm_sign} and {espg_emi_sign}.",
         learnt_novelty,
         lambda f: (
             f["verdicts"] == [*[UNDECIDED] * 7, NO, NO, UNDECIDED]
