@@ -56,7 +56,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/espg_emi.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=3e-4, beta=0.03, slots=3),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.1, slots=3),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, beta=0.03, slots=3),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, beta=0.1, slots=10),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, beta=0.03, slots=10),
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.1, slots=10),
