@@ -48,7 +48,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/coma.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=1e-2),
-    ("cleaner", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
     ("findtreasure", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
     ("findtreasure", "adam"): dict(learning_rate=1e-3, critic_learning_rate=1e-2),
     ("gotogether", "sign"): dict(learning_rate=3e-4, critic_learning_rate=1e-2),
