@@ -59,7 +59,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=30.0),
-    ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=3),
+    ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=3.0),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("climbing", "sign"): dict(learning_rate=1e-3, eta=3.0),

@@ -59,7 +59,7 @@ TUNED = {
     ("gotogether", "sign"): dict(learning_rate=1e-3, beta=0.03, lambda_im=0.3, rise=215),
     ("gotogether", "adam"): dict(learning_rate=3e-3, beta=0.03, lambda_im=0.3, rise=215),
     ("movebox", "sign"): dict(learning_rate=1e-3, beta=0.3, lambda_im=3.0, rise=430),
-    ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.03, lambda_im=3, rise=430),
+    ("movebox", "adam"): dict(learning_rate=1e-3, beta=0.03, lambda_im=3.0, rise=430),
     ("pushbox", "sign"): dict(learning_rate=1e-3, beta=1.0, lambda_im=30.0, rise=430),
     ("pushbox", "adam"): dict(learning_rate=3e-3, beta=10.0, lambda_im=30.0, rise=430),
 }

@@ -313,12 +313,12 @@ def show_states(cells):
 
 def remove(cells):
     """Remove what the cells have left, as --overwrite asks; UsageError if one of them is running."""
-    for cell in cells:
-        if not cell.run_dir.exists():
-            continue
-        with owned(cell, wait=False) as lock:
-            if lock is None:
+    there = [cell for cell in cells if cell.run_dir.exists()]
+    with contextlib.ExitStack() as stack:
+        for cell in there:  # all, before the first is lost
+            if stack.enter_context(owned(cell, wait=False)) is None:
                 raise envs.UsageError(f"{cell.name} is running; stop it before --overwrite, or wait for its end.")
+        for cell in there:
             shutil.rmtree(cell.run_dir)
 
 

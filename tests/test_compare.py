@@ -352,13 +352,14 @@ def test_a_cell_of_an_edited_script_is_said_and_run_again_only_if_asked(tmp_path
         assert "0 finished, 0 failed, 1 skipped" in out
 
 
-def test_what_is_running_is_not_overwritten(tmp_path, monkeypatch, capsys):
-    cell = Cell("pg", "pushbox", "sign", num_trials=1, num_episodes=2, runs=tmp_path)
-    finish(cell)
-    with compare.owned(cell):
+def test_nothing_is_overwritten_while_one_of_the_cells_is_running(tmp_path, monkeypatch, capsys):
+    cells = [Cell(method, "pushbox", "sign", num_trials=1, num_episodes=2, runs=tmp_path) for method in ("pg", "decespg")]
+    for cell in cells:
+        finish(cell)
+    with compare.owned(cells[1]):
         code, _, error = command(monkeypatch, capsys, *SMALL, "--overwrite", "--runs", tmp_path)
     assert (code, "is running; stop it before --overwrite" in error) == (2, True)
-    assert cell.finished
+    assert all(cell.finished for cell in cells)
 
 
 def test_a_broken_result_is_said_and_run_again(tmp_path, monkeypatch, capsys):
