@@ -53,7 +53,7 @@ WORLDS = {
 # The tuning rule's choice for each world and optimiser (benchmark/tuning/edti.csv); guesses where it has no row yet.
 TUNED = {
     ("cleaner", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=10.0),
-    ("cleaner", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0),
+    ("cleaner", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=10.0),
     ("findtreasure", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
