@@ -54,11 +54,12 @@ TUNED = {
     ("gotogether", "adam"): dict(learning_rate=1e-3, hysteresis=0.2, exploration=0.5),
     ("movebox", "adam"): dict(learning_rate=3e-4, hysteresis=0.2, exploration=0.2),
     ("pushbox", "adam"): dict(learning_rate=3e-4, hysteresis=0.1, exploration=0.5),
-    ("climbing", "adam"): dict(learning_rate=3e-3, hysteresis=0.1, exploration=0.1),
+    ("climbing", "adam"): dict(learning_rate=3e-3, hysteresis=0.1, exploration=0.2, replay_size=500, train_every=1),
     ("passage", "adam"): dict(learning_rate=1e-3, hysteresis=0.1, exploration=0.2),
     ("secretroom", "adam"): dict(learning_rate=1e-3, hysteresis=0.4, exploration=0.2),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, hysteresis=0.2, exploration=0.2)  # what a world of your own gets
+# What a world of your own gets, and any world whose tables above lack it.
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, hysteresis=0.2, exploration=0.2, replay_size=20_000, train_every=4)
 REWARD_SCALE = 10.0  # the networks learn from rewards divided by this, so from 0.3 to 10
 FINAL_EPSILON = 0.05  # where the schedule of epsilon ends, and of saved teams
 
@@ -75,12 +76,12 @@ class Args(RunArgs):
     """h, what is left of a step where the error is negative: 1 all, 0 nothing (None: tuned for the world; 0.2 in others)"""
     exploration: Annotated[float | None, Between(1e-3, 1)] = None
     """share of the episodes over which epsilon falls linearly from 1 to 0.05 (None: tuned for the world; 0.2 in others)"""
-    buffer_size: Annotated[int, AtLeast(1)] = 20_000
-    """steps that are kept for replay"""
+    replay_size: Annotated[int | None, AtLeast(1)] = None
+    """steps that are kept for replay (None: 500 in climbing, else 20000)"""
     batch_size: Annotated[int, AtLeast(1)] = 32
     """steps in the batch of an update (as in Mnih et al.)"""
-    train_every: Annotated[int, AtLeast(1)] = 4
-    """steps for each update, made up for at the end of an episode (as in Mnih et al.)"""
+    train_every: Annotated[int | None, AtLeast(1)] = None
+    """steps for each update, made up for at the end of an episode (as in Mnih et al.; None: 1 in climbing, else 4)"""
     target_every: Annotated[int, AtLeast(1)] = 1000
     """steps between two copies of the networks into the target networks, made at the end of an episode"""
 
@@ -199,7 +200,7 @@ def build(args, world, init):
     policy = StackedMLP(init, world.num_agents, [world.obs_dim, *args.hidden, world.num_actions])  # observations to Q(o, .)
     policy.head, policy.parameter = epsilon_greedy, FINAL_EPSILON  # how a saved team plays
     optimizer = MaskedAdam(policy.params, len(init), args.learning_rate)
-    replay = ConcurrentReplay(world, len(init), args.buffer_size)
+    replay = ConcurrentReplay(world, len(init), args.replay_size)
     return SimpleNamespace(policy=policy, target=deepcopy(policy), optimizer=optimizer, replay=replay)
 
 

@@ -269,7 +269,7 @@ def test_the_time_limit_bootstraps_and_an_end_does_not(ends, expected, tmp_path,
     world = Loop(np.array([ends]), [0], [[0], [0]], num_agents=2, obs_dim=1, cell=1.0, state_scale=[1.0], max_steps=5)
     monkeypatch.setattr(dqn, "resolve", lambda args, *_: (args, world))
     args = dict(env="loop", hidden=(16,), gamma=0.9, exploration=1.0, learning_rate=1e-3, num_episodes=300)
-    policy = train(dqn, tmp_path, **args, train_every=1, target_every=20, batch_size=2000, buffer_size=500).policy
+    policy = train(dqn, tmp_path, **args, train_every=1, target_every=20, batch_size=2000, replay_size=500).policy
     assert 10 * policy(torch.ones(2, 1, 1)).detach().numpy() == pytest.approx(np.full((2, 1, 1), expected), rel=0.05)
 
 
@@ -371,7 +371,7 @@ def test_every_update_descends_the_mean_squared_error_of_its_batch(env, tmp_path
     updates = record_updates(monkeypatch)
     every = dict(batch_size=5, train_every=3, target_every=20)
     args = dict(env=env, seed=4, num_trials=3, num_episodes=12, max_steps=11, learning_rate=0.05, gamma=0.9, log_every=1)
-    run = train(dqn, tmp_path, **args, **every, buffer_size=30)
+    run = train(dqn, tmp_path, **args, **every, replay_size=30)
     afters = [*(update.params for update in updates[1:]), weights(run.policy)]
     episodes = [list(group) for _, group in groupby(zip(updates, afters, strict=True), key=lambda pair: id(pair[0].rollout))]
     assert len(episodes) == 12

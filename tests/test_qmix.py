@@ -222,7 +222,7 @@ def test_the_time_limit_bootstraps_and_an_end_does_not(kind, ends, expected, tmp
     world = test_dqn.Loop(np.array([ends]), [0], [[0], [0]], num_agents=2, obs_dim=1, cell=1.0, state_scale=[0.0], max_steps=5)
     monkeypatch.setattr(qmix, "resolve", lambda args, *_: (args, world))
     args = dict(env="loop", hidden=(16,), gamma=0.9, exploration=1.0, learning_rate=1e-3, num_episodes=300, mixer=kind)
-    team = train(qmix, tmp_path, **args, train_every=1, target_every=20, batch_size=500, buffer_size=500)
+    team = train(qmix, tmp_path, **args, train_every=1, target_every=20, batch_size=500, replay_size=500)
     with torch.no_grad():
         values = qmix.of_team(team.policy(torch.ones(2, 1, 1))[..., 0], 1)
         assert 10 * team.mixer(values, torch.zeros(1, 1, 1)).item() == pytest.approx(expected, rel=0.05)
@@ -261,7 +261,7 @@ def test_every_update_descends_the_mean_squared_error_of_its_batch(kind, tmp_pat
     every = dict(batch_size=3, train_every=3, target_every=20)
     args = dict(env="findtreasure", seed=4, num_trials=3, num_episodes=9, max_steps=9, learning_rate=0.05, gamma=0.9)
     args |= dict(hidden=(6,), exploration=0.5, log_every=1, mixer=kind)
-    run = train(qmix, tmp_path, **args, **every, buffer_size=20)
+    run = train(qmix, tmp_path, **args, **every, replay_size=20)
     finals = [*weights(run.policy), *(param.detach() for param in run.mixer.params)]
     afters = [*(update.params for update in updates[1:]), finals]
     episodes = [list(group) for _, group in groupby(zip(updates, afters, strict=True), key=lambda pair: id(pair[0].rollout))]
@@ -329,10 +329,11 @@ def test_the_sum_of_one_agent_is_dqn_with_double_q(tmp_path, monkeypatch):
     monkeypatch.setattr(dqn, "squared_td_errors", double_errors)
     world = Walk(np.array([4]), [0], [[0]], num_agents=1, obs_dim=1, cell=0.25, state_scale=[0.25], max_steps=30)
     args = dict(env="walk", hidden=(16,), gamma=0.9, exploration=0.5, learning_rate=3e-3, num_episodes=60, num_trials=2)
+    every = dict(train_every=4, target_every=50)
     runs = {}
     for module, own in ((qmix, dict(mixer="sum")), (dqn, {})):
         monkeypatch.setattr(module, "resolve", lambda args, *_: (args, world))
-        runs[module] = train(module, tmp_path / module.__name__, **args, **own, target_every=50)
+        runs[module] = train(module, tmp_path / module.__name__, **args, **own, **every, replay_size=20_000)
     assert_same_run(runs[qmix], runs[dqn], ("policy", "target", "optimizer"))
     assert runs[qmix].log.outcomes[:, -20:].mean() > 0.8  # and it has learnt to walk
 
@@ -377,7 +378,7 @@ def test_the_two_step_game_goes_as_published(kind, tables, earned, tmp_path, mon
     monkeypatch.setattr(qmix, "FINAL_EPSILON", 1.0)  # full exploration
     monkeypatch.setattr(qmix, "REWARD_SCALE", 1.0)
     args = dict(env=str(TWO_STEP), num_trials=2, num_episodes=5000, mixer=kind, learning_rate=5e-4, gamma=0.99, log_every=5000)
-    team = train(qmix, tmp_path, **args, train_every=2, batch_size=64, target_every=200, buffer_size=1000)
+    team = train(qmix, tmp_path, **args, train_every=2, batch_size=64, target_every=200, replay_size=1000)
     found = learned(team, 2)
     assert np.abs(found - tables).max() < (0.05 if kind == "monotonic" else 0.5)
     assert [greedy_return(table) for table in found] == [earned] * 2

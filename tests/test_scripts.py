@@ -324,7 +324,7 @@ BAD_MEMORY = {"--slots -1": "--slots must be a number of at least 0, not -1"}
 BAD_REPLAY = {
     "--exploration 0": "--exploration must be a number between 0.001 and 1, not 0",
     "--exploration 2": "--exploration must be a number between 0.001 and 1, not 2",
-    "--buffer-size 0": "--buffer-size must be a number of at least 1, not 0",
+    "--replay-size 0": "--replay-size must be a number of at least 1, not 0",
     "--batch-size 0": "--batch-size must be a number of at least 1, not 0",
     "--train-every 0": "--train-every must be a number of at least 1, not 0",
     "--target-every 0": "--target-every must be a number of at least 1, not 0",
