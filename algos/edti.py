@@ -58,8 +58,8 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=30.0),
-    ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=3.0),
+    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=0.3, beta_ext=0.001, beta_int=0.01),
+    ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=0.3, beta_ext=0.001, beta_int=0.01),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("climbing", "sign"): dict(learning_rate=1e-3, eta=3.0),
@@ -69,7 +69,8 @@ TUNED = {
     ("secretroom", "sign"): dict(learning_rate=1e-3, eta=10.0),
     ("secretroom", "adam"): dict(learning_rate=3e-3, eta=30.0),
 }
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0)  # what a world of your own gets
+# What a world of your own gets, and any world whose tables above lack it.
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, eta=10.0, beta_ext=0.1, beta_int=1.0)
 REWARD_SCALE = 10.0  # the critics learn from rewards divided by this, so from 0.3 to 10; their curves are in units of reward
 
 
@@ -93,10 +94,10 @@ class Args(RunArgs):
     """weight of the others' rewards (the published code's)"""
     share_int: Annotated[float, AtLeast(0)] = 0.1
     """weight of the others' novelty (the published code's)"""
-    beta_ext: Annotated[float, AtLeast(0)] = 0.1
-    """weight of the influence on the others' values of the reward, V^ext (the published code's)"""
-    beta_int: Annotated[float, AtLeast(0)] = 1.0
-    """weight of the influence on the others' values of their novelty, V^int (the published code's)"""
+    beta_ext: Annotated[float | None, AtLeast(0)] = None
+    """weight of the influence on the others' values V^ext of reward (published code's; None: 0.001 in movebox, else 0.1)"""
+    beta_int: Annotated[float | None, AtLeast(0)] = None
+    """weight of the influence on the others' values V^int of novelty (published code's; None: 0.01 in movebox, else 1)"""
     table_size: Annotated[int, AtLeast(8)] = 2**19
     """places for counts in each trial's hash table, of 12 bytes each; what finds none counts as never seen"""
 

@@ -86,7 +86,7 @@ OWN = {
     "dqn": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
     "hysteretic": ("hysteresis", dict.fromkeys(EPISODES, (0.1, 0.2, 0.4))),
     "qmix": ("exploration", dict.fromkeys(EPISODES, (0.1, 0.2, 0.5))),
-    "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0))),
+    "edti": ("eta", dict.fromkeys(EPISODES, (3.0, 10.0, 30.0)) | {"movebox": (0.1, 0.3, 1.0)}),
     "decespg_ex2": ("beta", EXEMPLAR_BETAS),
     "espg_icm": ("beta", CURIOSITY_BETAS),
     "espg_emi": ("beta", EMBEDDING_BETAS),
