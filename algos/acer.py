@@ -52,7 +52,7 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-4),
-    ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4, entropy=1e-4),
+    ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-3, entropy=1e-4),
     ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-4, entropy=1e-4),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
