@@ -52,13 +52,12 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-4),
-    ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=1e-3, entropy=1e-4),
-    ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-4, entropy=1e-4),
+    ("movebox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
+    ("movebox", "adam"): dict(learning_rate=1e-3, critic_learning_rate=3e-4),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3),
     ("pushbox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=1e-3),
 }
-# What a world of your own gets, and any world whose tables above lack it.
-OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3, entropy=0.001)
+OTHER = dict(hidden=(64,), gamma=0.99, learning_rate=1e-3, critic_learning_rate=3e-3)  # what a world of your own gets
 REWARD_SCALE = 10.0  # the critic learns from rewards divided by this, so from 0.3 to 10; its curves are in units of reward
 
 
@@ -80,8 +79,8 @@ class Args(RunArgs):
     """how fast a step may lead away from the average policy, in divergence (delta of Eq. 11); a huge number: no bound"""
     average_decay: Annotated[float, Between(0, 1)] = 0.99
     """share of its weights that the average policy keeps in an update (alpha of Section 3.3)"""
-    entropy: Annotated[float | None, AtLeast(0)] = None
-    """weight of the policies' entropy, whose gradient is added to that of Eq. 9 (None: 0.0001 in movebox, else 0.001)"""
+    entropy: Annotated[float, AtLeast(0)] = 0.001
+    """weight of the policies' entropy, whose gradient is added to that of Eq. 9"""
     buffer_size: Annotated[int, AtLeast(1)] = 20_000
     """steps that are kept for replay"""
 
