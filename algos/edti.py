@@ -58,7 +58,7 @@ TUNED = {
     ("findtreasure", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
     ("gotogether", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=3.0),
     ("gotogether", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
-    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=0.3, beta_ext=0.001, beta_int=0.01),
+    ("movebox", "sign"): dict(learning_rate=1e-4, critic_learning_rate=3e-3, eta=0.1, beta_ext=0.001, beta_int=0.01),
     ("movebox", "adam"): dict(learning_rate=3e-4, critic_learning_rate=3e-3, eta=0.3, beta_ext=0.001, beta_int=0.01),
     ("pushbox", "sign"): dict(learning_rate=1e-3, critic_learning_rate=3e-3, eta=30.0),
     ("pushbox", "adam"): dict(learning_rate=3e-3, critic_learning_rate=3e-3, eta=10.0),
