@@ -239,6 +239,15 @@ def test_a_world_of_ones_own_gets_the_values_that_the_help_names(name, tmp_path,
     assert command(name, "--evaluate", directory / "policy.pt", "--num-episodes", 2).code == 0
 
 
+@each_script
+def test_a_world_that_a_help_text_names_gets_what_it_says(name):
+    for what, part in parts_of(name, SOURCES[f"{name}.py"]).items():
+        for number, world in re.findall(r"None: ([\d.]+) in (\w+), else", part.text):
+            rows = [row for (env, _), row in script(name).TUNED.items() if env == world]
+            assert rows
+            assert all(row[what.removeprefix("Args.")] == float(number) for row in rows)
+
+
 # --- a run: its curves, its end by an exception, its team ---
 
 WORDS = ["--env", "findtreasure", "--max-steps", 40, "--hidden", 16, "--num-trials", 2, "--seed", 5, "--num-episodes", 40]
